@@ -1,0 +1,155 @@
+"""From steps to options: what the meta-controller learns from (line 24 of Algorithm 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
+from torch import Tensor
+
+from hdrqn_torchrl import keys
+
+
+class OptionExtractor:
+    r"""Turns collected steps ``[N, T]`` into option transitions :math:`(\hat{o}_0, g, r^{ex}_{total}, \hat{o}')`.
+
+    A transition pairs the step at which an option started with the one at which it ended, however many
+    batches lie between them. Transitions come out by whole episodes, each in order and without gaps, once the
+    episode is over; so a replay buffer can hold them row by row. Batches must come from one collector, in
+    order, with the same N environments.
+
+    Args:
+        input_keys: what the meta-controller reads; kept from the start and, under ``"next"``, from the end.
+        mask_key: subgoals that can be chosen, kept likewise; ``None``: no mask.
+        subgoal_key: name of the chosen subgoal in the transitions (its value is ``active_subgoal_key``'s).
+        option_init_key, option_done_key, option_steps_key, option_return_key, active_subgoal_key: entries of
+            :class:`~hdrqn_torchrl.transforms.SubgoalTransform`.
+        init_key: first step of an episode.
+        traj_key: number of the episode.
+
+    Examples:
+        >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.transforms import SubgoalTransform
+        >>> transforms = Compose(InitTracker(), SubgoalTransform(num_subgoals=2))
+        >>> env = TransformedEnv(MultiGoalGridEnv(num_envs=4, max_steps=5, seed=0), transforms)
+        >>> steps = env.rollout(5, break_when_any_done=False)
+        >>> steps["collector", "traj_ids"] = torch.arange(4)[:, None].expand(4, 5)
+        >>> options = OptionExtractor(input_keys=["observation"])(steps)
+        >>> int(options["next", "option_steps"].sum())
+        20
+    """
+
+    def __init__(
+        self,
+        *,
+        input_keys: Sequence[NestedKey] = (keys.OBSERVATION,),
+        mask_key: NestedKey | None = keys.SUBGOAL_MASK,
+        subgoal_key: NestedKey = keys.SUBGOAL,
+        option_init_key: NestedKey = keys.OPTION_INIT,
+        option_done_key: NestedKey = keys.OPTION_DONE,
+        option_steps_key: NestedKey = keys.OPTION_STEPS,
+        option_return_key: NestedKey = keys.OPTION_RETURN,
+        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
+        init_key: NestedKey = keys.IS_INIT,
+        traj_key: NestedKey = keys.TRAJ_IDS,
+    ) -> None:
+        self.option_init_key, self.option_done_key = option_init_key, option_done_key
+        self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
+        inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
+        self._start_keys = [*inputs, init_key, traj_key]
+        self._end_keys = [*inputs, option_steps_key, option_return_key, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets options and episodes in progress (the collector started new episodes)."""
+        self._open_starts: TensorDictBase | None = None  # [N]: start of the option in progress
+        self._is_open: Tensor | None = None  # [N]
+        self._held: TensorDictBase | None = None  # [M]: finished options of unfinished episodes
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase | None:
+        """Returns the options ``[M]`` of all episodes that ended in ``batch`` ``[N, T]``; ``None`` if none did."""
+        starts = batch.select(*self._start_keys)
+        started = batch.get(self.option_init_key).squeeze(-1)
+        ended = batch.get(unravel_key(("next", self.option_done_key))).squeeze(-1)
+        if self._is_open is None:
+            self._open_starts, self._is_open = starts[:, 0].clone(), torch.zeros_like(started[:, 0])
+        starts = torch.cat([self._open_starts.unsqueeze(1), starts], 1)  # [N, 1 + T]: in progress, then new
+        # A batch that begins with a start where an option was open follows a reset: that option is lost.
+        started = torch.cat([(self._is_open & ~started[:, 0]).unsqueeze(1), started], 1)
+        ended = ended & (started.cumsum(1)[:, 1:] > 0)  # an option that started before the first batch is unknown
+
+        # In each environment starts and ends alternate, so the j-th end closes the j-th start; a last start may
+        # be left over. Both lists below are sorted by environment, then by time.
+        self._is_open = started.sum(1) > ended.sum(1)
+        last_start = started.shape[1] - 1 - started.flip(1).long().argmax(1)
+        environments = torch.arange(len(started), device=started.device)
+        self._open_starts = starts[environments, last_start]
+        started[environments, last_start] &= ~self._is_open
+        return self._release(self._pair(batch, starts, started, ended))
+
+    def _pair(self, batch: TensorDictBase, starts: TensorDictBase, started: Tensor, ended: Tensor) -> TensorDictBase:
+        environment, end_time = ended.nonzero(as_tuple=True)
+        options = starts[started]
+        after = batch.get("next")[environment, end_time]
+        options.set(self.subgoal_key, after.get(self.active_subgoal_key))
+        options.set("next", after.select(*self._end_keys))
+        return options.set("environment", environment)
+
+    def _release(self, options: TensorDictBase) -> TensorDictBase | None:
+        if self._held is not None:
+            options = torch.cat([self._held, options], 0)
+            options = options[options.get("environment").argsort(stable=True)]
+        environment, rows = options.get("environment"), torch.arange(len(options), device=options.device)
+        ends = torch.where(options.get(("next", keys.DONE)).squeeze(-1), rows, -1)
+        last_end = torch.full_like(self._is_open, -1, dtype=rows.dtype).scatter_reduce(0, environment, ends, "amax")
+        complete = rows <= last_end[environment]
+        self._held = options[~complete]
+        released = options[complete].exclude("environment")
+        return released if len(released) else None
+
+    def state_dict(self) -> dict[str, TensorDictBase | Tensor | None]:
+        """Options and episodes in progress."""
+        return {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
+
+    def load_state_dict(self, state: dict[str, TensorDictBase | Tensor | None]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self._open_starts, self._is_open, self._held = state["open_starts"], state["is_open"], state["held"]
+
+
+class StepSelector:
+    """Keeps of collected steps ``[N, T]`` what the sub-controller (or a flat agent) learns from.
+
+    Args:
+        root_keys: entries kept from the root.
+        next_keys: entries kept from ``"next"``, beside the ends of the episode.
+        subgoal_key: if given, the subgoal in force at each step is stored under this name, root and ``"next"``
+            (in a policy's raw output the root entry is a mere proposal).
+        active_subgoal_key: where the environment wrote the subgoal in force.
+        traj_key: number of the episode.
+    """
+
+    def __init__(
+        self,
+        *,
+        root_keys: Sequence[NestedKey],
+        next_keys: Sequence[NestedKey],
+        subgoal_key: NestedKey | None = None,
+        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
+        traj_key: NestedKey = keys.TRAJ_IDS,
+    ) -> None:
+        self.root_keys, self.subgoal_key, self.active_subgoal_key = list(root_keys), subgoal_key, active_subgoal_key
+        self.next_keys = [*next_keys, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
+        self.traj_key = traj_key
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Returns steps ``[N, T]``."""
+        steps = batch.select(*self.root_keys, self.traj_key)
+        after = batch.get("next").select(*self.next_keys)
+        if self.subgoal_key is not None:
+            in_force = batch.get(unravel_key(("next", self.active_subgoal_key)))
+            steps.set(self.subgoal_key, in_force)
+            after.set(self.subgoal_key, in_force)
+        return steps.set("next", after)

@@ -1,0 +1,39 @@
+"""TensorDict keys shared by environments, modules, replay and losses.
+
+Every class takes its keys as arguments; the names below are only their defaults. Shapes are given
+after the batch dimensions, ``G`` is the number of subgoals and ``H`` the size of an LSTM state.
+"""
+
+from __future__ import annotations
+
+# Written by the environment.
+OBSERVATION = "observation"  # [V, V] uint8 cell codes, or [3, 44, 44] uint8 pixels: o_t
+REWARD = "reward"  # [1] float32: total reward of the task
+EXTRINSIC_REWARD = "extrinsic_reward"  # [1] float32: r^ex
+ATTAINED = "attained"  # [G] bool: subgoals reached by this very step
+HAZARD = "hazard"  # [1] bool: obstacle hit or life lost in this step
+SUCCESS = "success"  # [1] bool: the whole task was completed by this very step
+IS_INIT = "is_init"  # [1] bool: first step of an episode
+
+# Written by the policy.
+ACTION = "action"  # [] int64
+SUBGOAL = "subgoal"  # [] int64: the meta-controller's proposal, honoured where OPTION_INIT
+ACTION_VALUE = "action_value"  # [A] float32: Q-values
+SUB_HIDDEN, SUB_CELL = "sub_hidden", "sub_cell"  # [H] float32: h^S
+META_HIDDEN, META_CELL = "meta_hidden", "meta_cell"  # [H] float32: h^M
+
+# Written by SubgoalTransform.
+OPTION_INIT = "option_init"  # [1] bool: the next policy call starts an option
+ACTIVE_SUBGOAL = "active_subgoal"  # [] int64: g of the option in progress
+SUBGOAL_MASK = "subgoal_mask"  # [G] bool: subgoals that can be chosen
+OPTION_STEPS = "option_steps"  # [1] int64: k
+OPTION_RETURN = "option_return"  # [1] float32: r^ex collected by the option
+SUBGOAL_REACHED = "subgoal_reached"  # [1] bool
+OPTION_DONE = "option_done"  # [1] bool
+OPTION_TERMINATED = "option_terminated"  # [1] bool
+INTRINSIC_REWARD = "intrinsic_reward"  # [1] float32: r^in
+
+# TorchRL's own.
+DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
+TRAJ_IDS = ("collector", "traj_ids")
+PAD_MASK = ("collector", "mask")  # written by SliceSampler where it pads short trajectories

@@ -1,0 +1,157 @@
+"""One level of the agent as a learner: its replay memory, loss, optimiser and target network (Algorithms 3 and 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.objectives import SoftUpdate
+
+from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.objectives import RecurrentDQNLoss
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerSettings:
+    """How one level learns. The defaults are the paper's where it states them.
+
+    Args:
+        slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level).
+        batch_size: sequences of a minibatch.
+        capacity: transitions kept in the replay memory.
+        frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
+        warmup_frames: environment frames before the first update.
+        learning_rate: of Adam.
+        tau: rate of the soft target update.
+        max_grad_norm: gradients are clipped to this norm; ``None``: not at all.
+        burn_in: share of a sequence left out of the loss at its beginning.
+        train_exact_states: train leading steps whose recurrent state is exact (see
+            :func:`~hdrqn_torchrl.objectives.training_mask`).
+        loss_function: ``"l2"`` or ``"smooth_l1"``.
+        double: Double DQN.
+
+    Raises:
+        ValueError: if a value breaks its rule.
+    """
+
+    slice_len: int = 8
+    batch_size: int = 32
+    capacity: int = 100_000
+    frames_per_update: float = 8.0
+    warmup_frames: int = 5_000
+    learning_rate: float = 1e-3
+    tau: float = 1e-3
+    max_grad_norm: float | None = None
+    burn_in: float = 0.5
+    train_exact_states: bool = True
+    loss_function: Literal["l2", "smooth_l1"] = "l2"
+    double: bool = True
+
+    def __post_init__(self) -> None:
+        rules = (
+            ("slice_len", self.slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
+            ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
+            ("capacity", self.capacity >= self.slice_len, ">= slice_len", "use 100000 for steps, 50000 for options"),
+            ("frames_per_update", self.frames_per_update > 0, "> 0", "use 8"),
+            ("warmup_frames", self.warmup_frames >= 0, ">= 0", "use 5000"),
+            ("learning_rate", self.learning_rate > 0, "> 0", "the paper uses 0.001"),
+            ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
+            ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
+        )
+        for name, holds, rule, remedy in rules:
+            if not holds:
+                raise ValueError(f"{name} must be {rule}, got {getattr(self, name)}; {remedy}.")
+
+
+class Learner:
+    """Stores what was collected, samples sequences, and updates one network from them.
+
+    Args:
+        network: the controller that is trained; the policy acts with the same parameters.
+        settings: how it learns.
+        extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet.
+        loss_keys: keys of the loss, as in :meth:`RecurrentDQNLoss.set_keys`.
+        gamma: discount of one environment step.
+        num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
+        samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
+            and one large draw costs little more than a small one.
+
+    Examples:
+        See :func:`hdrqn_torchrl.algorithms.make_drqn`, which builds one.
+    """
+
+    def __init__(
+        self,
+        network: TensorDictModuleBase,
+        settings: LearnerSettings,
+        *,
+        extract: Callable[[TensorDictBase], TensorDictBase | None],
+        loss_keys: dict[str, NestedKey | None],
+        gamma: float = 0.99,
+        num_envs: int | None = None,
+        samples_per_draw: int = 8,
+    ) -> None:
+        self.network, self.settings, self.extract = network, settings, extract
+        self.loss = RecurrentDQNLoss(
+            network,
+            gamma=gamma,
+            burn_in=settings.burn_in,
+            train_exact_states=settings.train_exact_states,
+            loss_function=settings.loss_function,
+            double=settings.double,
+        )
+        self.loss.set_keys(**loss_keys)
+        self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
+        self._parameters = list(network.parameters())
+        self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, fused=True)
+        self.buffer = make_sequence_buffer(
+            settings.capacity,
+            slice_len=settings.slice_len,
+            batch_size=settings.batch_size * samples_per_draw,
+            num_envs=num_envs,
+            device=self._parameters[0].device,
+        )
+        self._drawn: list[TensorDictBase] = []
+        self.updates, self.frames = 0, 0
+
+    def store(self, batch: TensorDictBase) -> None:
+        """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
+        self.frames += batch.numel()
+        self._drawn = []
+        transitions = self.extract(batch)
+        if transitions is not None:
+            self.buffer.extend(transitions)
+
+    def updates_due(self) -> int:
+        """How many updates are owed for the frames seen so far."""
+        owed = (self.frames - self.settings.warmup_frames) / self.settings.frames_per_update
+        return max(0, int(owed) - self.updates) if len(self.buffer) else 0
+
+    def sample(self) -> TensorDictBase:
+        """One minibatch of sequences ``[batch_size, slice_len]``."""
+        if not self._drawn:
+            sequences = sample_sequences(self.buffer, self.settings.slice_len)
+            self._drawn = list(sequences.split(self.settings.batch_size, 0))
+        return self._drawn.pop()
+
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """One gradient step on ``sample`` and one soft update of the target network.
+
+        Returns:
+            Scalars without gradient: ``loss``, ``td_error``, ``q_value``, ``target``, ``trained_steps`` and, if
+            gradients are clipped, ``grad_norm``.
+        """
+        metrics = dict(self.loss(sample).items())
+        self.optimizer.zero_grad()
+        metrics["loss"].backward()
+        if self.settings.max_grad_norm is not None:
+            metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._parameters, self.settings.max_grad_norm)
+        self.optimizer.step()
+        self.target_updater.step()
+        self.updates += 1
+        return {name: value.detach() for name, value in metrics.items()}

@@ -1,0 +1,19 @@
+"""Networks, controllers and exploration as (TensorDict) modules."""
+
+from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy
+from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
+from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
+
+__all__ = [
+    "CellFeatures",
+    "CellsToImage",
+    "ConvFeatures",
+    "DuelingHead",
+    "EpsilonGreedy",
+    "FullyConnectedFeatures",
+    "HierarchicalPolicy",
+    "MetaController",
+    "QNetwork",
+    "SubController",
+]

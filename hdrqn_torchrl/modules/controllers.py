@@ -1,0 +1,210 @@
+"""The two levels of the agent as TensorDict modules (Algorithm 1, lines 15 and 17).
+
+A controller has two paths through the same parameters. Acting (the default) takes one step from the LSTM
+state in the tensordict. Learning (inside ``set_recurrent_mode(True)``, which every TorchRL loss enters)
+unrolls whole sequences ``[B, T]`` from the zero state. Each is one ``TensorDictModuleBase`` and not a chain
+of TorchRL's modules because such a chain costs several times the arithmetic of a small network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.modules import recurrent_mode
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy
+from hdrqn_torchrl.modules.q_network import QNetwork
+
+
+class SubController(TensorDictModuleBase):
+    """Chooses the primitive action from observation and subgoal: Q^S({o, g}, a).
+
+    Its LSTM state restarts from zero where ``init_key`` is set: at each option for a hierarchical agent, at
+    each episode for a flat one (``subgoal_key=None, init_key="is_init"``), in acting and learning alike.
+
+    Args:
+        network: Q-network with ``num_conditions`` = number of subgoals (0 for a flat agent).
+        exploration: epsilon-greedy choice; ``None`` is always greedy.
+        observation_key, action_key, action_value_key: as named.
+        subgoal_key: the subgoal in force, or ``None`` for a flat agent.
+        init_key: where the state restarts.
+        hidden_key, cell_key: LSTM state ``[H]``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from hdrqn_torchrl.modules import CellFeatures
+        >>> network = QNetwork(CellFeatures(5, num_codes=5), num_actions=4, hidden_size=8, num_conditions=2)
+        >>> sub = SubController(network)
+        >>> td = TensorDict(observation=torch.zeros(3, 5, 5, dtype=torch.uint8), batch_size=3)
+        >>> td["subgoal"], td["option_init"] = torch.tensor([0, 1, 1]), torch.ones(3, 1, dtype=torch.bool)
+        >>> td["sub_hidden"] = td["sub_cell"] = torch.zeros(3, 8)
+        >>> sub(td)["action"].shape
+        torch.Size([3])
+    """
+
+    def __init__(
+        self,
+        network: QNetwork,
+        exploration: EpsilonGreedy | None = None,
+        *,
+        observation_key: NestedKey = keys.OBSERVATION,
+        subgoal_key: NestedKey | None = keys.SUBGOAL,
+        init_key: NestedKey = keys.OPTION_INIT,
+        action_key: NestedKey = keys.ACTION,
+        action_value_key: NestedKey = keys.ACTION_VALUE,
+        hidden_key: NestedKey = keys.SUB_HIDDEN,
+        cell_key: NestedKey = keys.SUB_CELL,
+    ) -> None:
+        super().__init__()
+        if (subgoal_key is None) != (network.num_conditions == 0):
+            raise ValueError(
+                f"subgoal_key must be None exactly when the network has no condition, got subgoal_key={subgoal_key!r} "
+                f"and num_conditions={network.num_conditions}; set num_conditions to the number of subgoals."
+            )
+        self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
+        self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
+        self.action_key, self.action_value_key = action_key, action_value_key
+        self.hidden_key, self.cell_key = hidden_key, cell_key
+        self.in_keys = [observation_key, *([] if subgoal_key is None else [subgoal_key]), init_key]
+        self.out_keys = [action_key]
+        if network.recurrent:
+            self.in_keys += [hidden_key, cell_key]
+            self.out_keys += [_next(hidden_key), _next(cell_key)]
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
+        return _primer(self.network, self.hidden_key, self.cell_key)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation = tensordict.get(self.observation_key)
+        subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
+        init = tensordict.get(self.init_key)  # [*batch, 1]
+        if recurrent_mode():
+            return tensordict.set(self.action_value_key, self.network.unroll(observation, subgoal, init.squeeze(-1)))
+        if not self.network.recurrent:
+            value, _ = self.network.step(observation, subgoal, ())
+            return tensordict.set(self.action_key, self.exploration(value))
+        hidden = tensordict.get(self.hidden_key).masked_fill(init, 0.0)
+        cell = tensordict.get(self.cell_key).masked_fill(init, 0.0)
+        value, (hidden, cell) = self.network.step(observation, subgoal, (hidden, cell))
+        tensordict.set(self.action_key, self.exploration(value))
+        tensordict.set(_next(self.hidden_key), hidden)
+        return tensordict.set(_next(self.cell_key), cell)
+
+
+class MetaController(TensorDictModuleBase):
+    r"""Chooses the subgoal where an option starts: :math:`Q^M(\hat{o}, g)`.
+
+    Elsewhere subgoal and LSTM state are kept. What it reads makes the version: the observation (v1,
+    ``in_keys=["observation"]``) or the sub-controller's state at the end of the last option (v2,
+    ``in_keys=["sub_hidden"]``, ``["sub_cell"]`` or both).
+
+    Args:
+        network: Q-network over subgoals, without condition.
+        exploration: epsilon-greedy choice; ``None`` is always greedy.
+        input_keys: entries read, concatenated along the last dimension if several.
+        mask_key: subgoals that may be chosen ``[G]`` bool; ``None``: all of them.
+        subgoal_key: the choice.
+        gate_key: where an option starts ``[1]`` bool.
+        active_subgoal_key: the subgoal to keep elsewhere.
+        action_value_key: Q-values, written in learning.
+        hidden_key, cell_key: LSTM state ``[H]``.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from hdrqn_torchrl.modules import FullyConnectedFeatures
+        >>> network = QNetwork(FullyConnectedFeatures(8, (8,)), num_actions=2, hidden_size=8)
+        >>> meta = MetaController(network, input_keys=["sub_hidden"], mask_key=None)
+        >>> td = TensorDict(sub_hidden=torch.zeros(3, 8), active_subgoal=torch.ones(3, dtype=torch.int64), batch_size=3)
+        >>> td["option_init"] = torch.tensor([[True], [False], [False]])
+        >>> td["meta_hidden"] = td["meta_cell"] = torch.zeros(3, 8)
+        >>> meta(td)["subgoal"][1:]
+        tensor([1, 1])
+    """
+
+    def __init__(
+        self,
+        network: QNetwork,
+        exploration: EpsilonGreedy | None = None,
+        *,
+        input_keys: Sequence[NestedKey] = (keys.OBSERVATION,),
+        mask_key: NestedKey | None = keys.SUBGOAL_MASK,
+        subgoal_key: NestedKey = keys.SUBGOAL,
+        gate_key: NestedKey = keys.OPTION_INIT,
+        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
+        action_value_key: NestedKey = keys.ACTION_VALUE,
+        hidden_key: NestedKey = keys.META_HIDDEN,
+        cell_key: NestedKey = keys.META_CELL,
+    ) -> None:
+        super().__init__()
+        self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
+        self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
+        self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
+        self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key
+        self.acting_keys = [gate_key, active_subgoal_key]
+        self.in_keys = [*self.input_keys, *([] if mask_key is None else [mask_key])]
+        self.out_keys = [subgoal_key]
+        if network.recurrent:
+            self.in_keys += [hidden_key, cell_key]
+            self.out_keys += [_next(hidden_key), _next(cell_key)]
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
+        return _primer(self.network, self.hidden_key, self.cell_key)
+
+    def _inputs(self, tensordict: TensorDictBase) -> Tensor:
+        inputs = [tensordict.get(key) for key in self.input_keys]
+        return inputs[0] if len(inputs) == 1 else torch.cat(inputs, -1)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        inputs = self._inputs(tensordict)
+        if recurrent_mode():
+            return tensordict.set(self.action_value_key, self.network.unroll(inputs))
+        gate = tensordict.get(self.gate_key)
+        mask = None if self.mask_key is None else tensordict.get(self.mask_key)
+        hidden = cell = None
+        if self.network.recurrent:
+            hidden, cell = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
+        value, state = self.network.step(inputs, None, (hidden, cell))
+        choice = torch.where(gate.squeeze(-1), self.exploration(value, mask), tensordict.get(self.active_subgoal_key))
+        tensordict.set(self.subgoal_key, choice)
+        if self.network.recurrent:
+            tensordict.set(_next(self.hidden_key), torch.where(gate, state[0], hidden))
+            tensordict.set(_next(self.cell_key), torch.where(gate, state[1], cell))
+        return tensordict
+
+
+class HierarchicalPolicy(TensorDictModuleBase):
+    """Meta-controller, then sub-controller: one decision of the whole agent.
+
+    Args:
+        meta_controller: writes the subgoal.
+        sub_controller: reads it and writes the action.
+    """
+
+    def __init__(self, meta_controller: MetaController, sub_controller: SubController) -> None:
+        super().__init__()
+        self.meta_controller, self.sub_controller = meta_controller, sub_controller
+        made = [key for key in meta_controller.out_keys if key in sub_controller.in_keys]
+        wanted = [*meta_controller.acting_keys, *meta_controller.in_keys, *sub_controller.in_keys]
+        self.in_keys = list(dict.fromkeys(key for key in wanted if key not in made))
+        self.out_keys = [*meta_controller.out_keys, *sub_controller.out_keys]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.sub_controller(self.meta_controller(tensordict))
+
+
+def _next(key: NestedKey) -> tuple[str, ...]:
+    return ("next", *((key,) if isinstance(key, str) else key))
+
+
+def _primer(network: QNetwork, hidden_key: NestedKey, cell_key: NestedKey) -> TensorDictPrimer:
+    state = Unbounded(shape=(network.hidden_size,))
+    return TensorDictPrimer({hidden_key: state, cell_key: state.clone()}, expand_specs=True)

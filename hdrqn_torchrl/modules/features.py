@@ -1,0 +1,138 @@
+"""Feature extractors: what stands between an observation and the recurrent layer.
+
+Each is a plain module that maps ``[*, ...]`` to ``[*, out_features]`` for any number of leading dimensions,
+so that one instance serves single steps and whole sequences.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hdrqn_torchrl.envs.cells import nearest_cell, palette
+
+
+class CellsToImage(nn.Module):
+    """Draws cell codes as a colour image, inside the network: replay keeps 25 bytes a view, not 5,808.
+
+    Args:
+        view: side of the window in cells.
+        num_codes: number of cell codes.
+        size: side of the image in pixels.
+
+    Shapes:
+        ``[*, view, view]`` uint8 -> ``[*, 3, size, size]`` float in [0, 1].
+
+    Examples:
+        >>> CellsToImage(view=5, num_codes=5)(torch.zeros(2, 5, 5, dtype=torch.uint8)).shape
+        torch.Size([2, 3, 44, 44])
+    """
+
+    def __init__(self, view: int, num_codes: int, size: int = 44) -> None:
+        super().__init__()
+        nearest = nearest_cell(size, view)
+        self.register_buffer("_pixel_cells", (nearest[:, None] * view + nearest[None, :]).flatten(), persistent=False)
+        self.register_buffer("_colours", palette(num_codes).float() / 255, persistent=False)
+        self.size = size
+
+    def forward(self, cells: Tensor) -> Tensor:
+        pixels = cells.flatten(-2).long()[..., self._pixel_cells]
+        return self._colours[pixels].movedim(-1, -2).unflatten(-1, (self.size, self.size))
+
+
+class ConvFeatures(nn.Module):
+    """Four convolutions with ReLU, then one dense layer with ReLU: the paper's image features.
+
+    Args:
+        in_channels: channels of the image.
+        size: side of the image in pixels.
+        out_features: number of features.
+        channels: output channels of the four convolutions.
+
+    Shapes:
+        ``[*, in_channels, size, size]`` uint8 in [0, 255] or float in [0, 1] -> ``[*, out_features]``.
+
+    Examples:
+        >>> ConvFeatures()(torch.zeros(2, 8, 3, 44, 44)).shape
+        torch.Size([2, 8, 256])
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 3,
+        size: int = 44,
+        out_features: int = 256,
+        channels: tuple[int, int, int, int] = (32, 64, 64, 64),
+    ) -> None:
+        super().__init__()
+        kernels_and_strides = ((5, 2), (3, 2), (3, 2), (3, 1))
+        layers: list[nn.Module] = []
+        previous = in_channels
+        for width, (kernel, stride) in zip(channels, kernels_and_strides, strict=True):
+            layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU()]
+            previous, size = width, (size - kernel) // stride + 1
+        if size < 1:
+            raise ValueError("size must be >= 38 pixels for four convolutions; use 44 as the paper does.")
+        self.convolutions = nn.Sequential(*layers)
+        self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * size * size, out_features), nn.ReLU())
+        self.out_features = out_features
+
+    def forward(self, image: Tensor) -> Tensor:
+        if image.dtype == torch.uint8:
+            image = image.float() / 255
+        leading = image.shape[:-3]
+        return self.dense(self.convolutions(image.reshape(-1, *image.shape[-3:]))).unflatten(0, leading)
+
+
+class CellFeatures(nn.Module):
+    """Cell codes as one-hot vectors through small dense layers: the same information as the image, cheaply.
+
+    Args:
+        view: side of the window in cells.
+        num_codes: number of cell codes.
+        widths: sizes of the dense layers.
+
+    Shapes:
+        ``[*, view, view]`` uint8 -> ``[*, widths[-1]]``.
+
+    Examples:
+        >>> CellFeatures(view=5, num_codes=5)(torch.zeros(2, 5, 5, dtype=torch.uint8)).shape
+        torch.Size([2, 128])
+    """
+
+    def __init__(self, view: int, num_codes: int, widths: tuple[int, ...] = (128,)) -> None:
+        super().__init__()
+        self.register_buffer("_one_hot", torch.eye(num_codes), persistent=False)
+        self.dense = _dense_layers(view * view * num_codes, widths)
+        self.out_features = widths[-1]
+
+    def forward(self, cells: Tensor) -> Tensor:
+        return self.dense(self._one_hot[cells.flatten(-2).long()].flatten(-2))
+
+
+class FullyConnectedFeatures(nn.Module):
+    """Dense layers with ReLU on a vector: what v2's meta-controller puts on the sub-controller's hidden state.
+
+    Args:
+        in_features: size of the vector.
+        widths: sizes of the dense layers; the paper has four of 256.
+
+    Shapes:
+        ``[*, in_features]`` -> ``[*, widths[-1]]``.
+    """
+
+    def __init__(self, in_features: int, widths: tuple[int, ...] = (256, 256, 256, 256)) -> None:
+        super().__init__()
+        self.dense = _dense_layers(in_features, widths)
+        self.out_features = widths[-1]
+
+    def forward(self, vector: Tensor) -> Tensor:
+        return self.dense(vector)
+
+
+def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for width in widths:
+        layers += [nn.Linear(in_features, width), nn.ReLU()]
+        in_features = width
+    return nn.Sequential(*layers)

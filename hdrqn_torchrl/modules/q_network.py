@@ -1,0 +1,115 @@
+"""Features -> recurrent layer (or none) -> dueling Q-values (figure 3 of the paper)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+State = tuple[Tensor, Tensor]
+
+
+class DuelingHead(nn.Module):
+    """Q = V + A - mean(A), with value and advantage as two linear streams (Wang et al., 2015)."""
+
+    def __init__(self, in_features: int, num_actions: int) -> None:
+        super().__init__()
+        self.streams = nn.Linear(in_features, 1 + num_actions)
+
+    def forward(self, features: Tensor) -> Tensor:
+        streams = self.streams(features)
+        value, advantage = streams[..., :1], streams[..., 1:]
+        return value + advantage - advantage.mean(-1, keepdim=True)
+
+
+class QNetwork(nn.Module):
+    """Q-values of every action from an observation, an optional condition and a recurrent state.
+
+    Args:
+        features: maps observations to vectors of ``features.out_features``.
+        num_actions: A.
+        hidden_size: H, size of the recurrent layer (or of the dense layer in its place).
+        num_conditions: number of values of an integer condition (the subgoal), appended to the features as
+            a one-hot vector; 0 for none.
+        recurrent: ``False`` replaces the LSTM by a dense layer with ReLU; states then pass through unchanged.
+
+    Examples:
+        >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
+        >>> network = QNetwork(FullyConnectedFeatures(6, (8,)), num_actions=4, hidden_size=16, num_conditions=2)
+        >>> state = network.initial_state(3)
+        >>> q, state = network.step(torch.zeros(3, 6), torch.tensor([0, 1, 1]), state)
+        >>> q.shape, network.unroll(torch.zeros(3, 5, 6), torch.zeros(3, 5, dtype=torch.int64)).shape
+        (torch.Size([3, 4]), torch.Size([3, 5, 4]))
+    """
+
+    def __init__(
+        self,
+        features: nn.Module,
+        *,
+        num_actions: int,
+        hidden_size: int,
+        num_conditions: int = 0,
+        recurrent: bool = True,
+    ) -> None:
+        super().__init__()
+        if hidden_size < 1:
+            raise ValueError(f"hidden_size must be >= 1, got {hidden_size}; the paper uses 256.")
+        self.features, self.hidden_size, self.recurrent = features, hidden_size, recurrent
+        self.num_actions, self.num_conditions = num_actions, num_conditions
+        size = features.out_features + num_conditions
+        if recurrent:
+            self.memory: nn.Module = nn.LSTM(size, hidden_size, batch_first=True)
+        else:
+            self.memory = nn.Sequential(nn.Linear(size, hidden_size), nn.ReLU())
+        self.register_buffer("_one_hot", torch.eye(num_conditions), persistent=False)
+        self.head = DuelingHead(hidden_size, num_actions)
+
+    def initial_state(self, *batch: int) -> State:
+        """Zero LSTM state, two tensors ``[*batch, H]``."""
+        zeros = self.head.streams.weight.new_zeros((*batch, self.hidden_size))
+        return zeros, zeros.clone()
+
+    def _embed(self, observation: Tensor, condition: Tensor | None) -> Tensor:
+        features = self.features(observation)
+        return features if condition is None else torch.cat([features, self._one_hot[condition]], -1)
+
+    def _cell(self, features: Tensor, state: State) -> State:
+        memory = self.memory
+        return torch.lstm_cell(
+            features, state, memory.weight_ih_l0, memory.weight_hh_l0, memory.bias_ih_l0, memory.bias_hh_l0
+        )
+
+    def step(self, observation: Tensor, condition: Tensor | None, state: State) -> tuple[Tensor, State]:
+        """One decision: Q-values ``[*, A]`` and the state after ``observation`` ``[*, ...]``, ``condition`` ``[*]``."""
+        features = self._embed(observation, condition)
+        if not self.recurrent:
+            return self.head(self.memory(features)), state
+        if features.ndim == 1:
+            hidden, cell = self._cell(features[None], (state[0][None], state[1][None]))
+            hidden, cell = hidden[0], cell[0]
+        else:
+            hidden, cell = self._cell(features, state)
+        return self.head(hidden), (hidden, cell)
+
+    def unroll(self, observation: Tensor, condition: Tensor | None = None, init: Tensor | None = None) -> Tensor:
+        """Q-values along sequences that start from the zero state.
+
+        Args:
+            observation: ``[B, T, ...]``.
+            condition: ``[B, T]`` int64, or ``None`` if the network has no condition.
+            init: ``[B, T]`` bool; where set, the state restarts from zero before that step.
+
+        Returns:
+            ``[B, T, A]``.
+        """
+        features = self._embed(observation, condition)
+        if not self.recurrent:
+            return self.head(self.memory(features))
+        if init is None:
+            return self.head(self.memory(features)[0])
+        keep = (~init).to(features.dtype).unsqueeze(-1)
+        hidden, cell = self.initial_state(len(features))
+        outputs = []
+        for time, inputs in enumerate(features.unbind(1)):
+            hidden, cell = self._cell(inputs, (hidden * keep[:, time], cell * keep[:, time]))
+            outputs.append(hidden)
+        return self.head(torch.stack(outputs, 1))
