@@ -1,11 +1,13 @@
 """Networks, controllers and exploration as (TensorDict) modules."""
 
+from hdrqn_torchrl.modules.architectures import Architecture, compact_network, paper_network
 from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy
 from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
 from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
 
 __all__ = [
+    "Architecture",
     "CellFeatures",
     "CellsToImage",
     "ConvFeatures",
@@ -16,4 +18,6 @@ __all__ = [
     "MetaController",
     "QNetwork",
     "SubController",
+    "compact_network",
+    "paper_network",
 ]

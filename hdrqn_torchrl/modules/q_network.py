@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from hdrqn_torchrl.modules.lstm import restarting_lstm
+
 State = tuple[Tensor, Tensor]
 
 
@@ -104,12 +106,6 @@ class QNetwork(nn.Module):
         features = self._embed(observation, condition)
         if not self.recurrent:
             return self.head(self.memory(features))
-        if init is None:
+        if init is None or not init[:, 1:].any():
             return self.head(self.memory(features)[0])
-        keep = (~init).to(features.dtype).unsqueeze(-1)
-        hidden, cell = self.initial_state(len(features))
-        outputs = []
-        for time, inputs in enumerate(features.unbind(1)):
-            hidden, cell = self._cell(inputs, (hidden * keep[:, time], cell * keep[:, time]))
-            outputs.append(hidden)
-        return self.head(torch.stack(outputs, 1))
+        return self.head(restarting_lstm(self.memory, features, init, self.initial_state(len(features))))

@@ -1,0 +1,223 @@
+"""DQN, DRQN, hDQN, hDRQNv1 and hDRQNv2 as pure builders over the same parts.
+
+A builder reads the specs of a bare environment and returns an :class:`Algorithm`: a policy, one learner per
+level, and the transforms that the environment needs. The training loop never asks which one it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.data import OptionExtractor, StepSelector
+from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.transforms import SubgoalTransform
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """A policy, its learners (one per level, by name) and the transforms its environment needs."""
+
+    policy: TensorDictModuleBase
+    learners: dict[str, Learner]
+    explorations: dict[str, EpsilonGreedy]
+    make_transforms: Callable[[], Compose]
+
+    def transform(self, env: EnvBase) -> TransformedEnv:
+        """The environment as this algorithm sees it."""
+        return TransformedEnv(env, self.make_transforms())
+
+
+def make_drqn(
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    learner: LearnerSettings = LearnerSettings(),  # noqa: B008 (frozen)
+    exploration: EpsilonGreedy | None = None,
+    gamma: float = 0.99,
+    recurrent: bool = True,
+) -> Algorithm:
+    """Flat recurrent Q-learning (Hausknecht and Stone, 2015) on the task's total reward.
+
+    Args:
+        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        architecture: networks.
+        learner: how it learns.
+        exploration: its schedule.
+        gamma: discount of one step.
+        recurrent: ``False`` gives DQN.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> list(make_drqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
+        ['flat']
+    """
+    exploration = exploration or EpsilonGreedy()
+    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
+    network = architecture.q_network(observation, num_actions=num_actions, recurrent=recurrent)
+    policy = SubController(network, exploration, subgoal_key=None, init_key=keys.IS_INIT).to(env.device)
+    flat = Learner(
+        policy,
+        learner,
+        extract=StepSelector(
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT], next_keys=[keys.OBSERVATION, keys.REWARD]
+        ),
+        loss_keys={},
+        gamma=gamma,
+        num_envs=env.batch_size[0],
+    )
+    return Algorithm(
+        policy=policy,
+        learners={"flat": flat},
+        explorations={"flat": exploration},
+        make_transforms=lambda: Compose(InitTracker(), policy.make_tensordict_primer()),
+    )
+
+
+make_dqn = partial(make_drqn, recurrent=False)
+"""Flat Q-learning without memory (Mnih et al., 2015); see :func:`make_drqn`."""
+
+
+def make_hdrqn(
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    version: Literal["v1", "v2"] = "v2",
+    sub: LearnerSettings = LearnerSettings(),  # noqa: B008
+    meta: LearnerSettings = LearnerSettings(slice_len=1, capacity=50_000),  # noqa: B008
+    sub_exploration: EpsilonGreedy | None = None,
+    meta_exploration: EpsilonGreedy | None = None,
+    gamma: float = 0.99,
+    smdp_discount: bool = True,
+    meta_input: Literal["hidden", "cell", "both"] = "hidden",
+    mask_reached: bool = True,
+    repeatable_subgoals: bool = False,
+    wrong_subgoal_reward: float = 0.0,
+    hazard_reward: float = -1.0,
+    max_option_steps: int | None = None,
+    recurrent: bool = True,
+) -> Algorithm:
+    r"""Hierarchical deep recurrent Q-learning (Algorithm 1).
+
+    Args:
+        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        architecture: networks.
+        version: what the meta-controller reads: ``"v1"`` the observation, ``"v2"`` the sub-controller's state.
+        sub, meta: how each level learns.
+        sub_exploration, meta_exploration: their schedules.
+        gamma: discount of one step.
+        smdp_discount: discount the option's return inside the option and what follows by :math:`\gamma^k`;
+            ``False``: plain sum and :math:`\gamma`.
+        meta_input: which part of the LSTM state v2 reads.
+        mask_reached: let the meta-controller choose only among subgoals not yet attained.
+        repeatable_subgoals: whether subgoals can be attained again (then nothing is masked).
+        wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one.
+        hazard_reward: intrinsic reward for meeting the hazard.
+        max_option_steps: step limit of an option.
+        recurrent: ``False`` gives hDQN (with ``version="v1"``).
+
+    Raises:
+        ValueError: if ``version`` or ``meta_input`` is unknown, or v2 is asked for without recurrence.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> list(make_hdrqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
+        ['sub', 'meta']
+    """
+    if version not in ("v1", "v2"):
+        raise ValueError(f"version must be 'v1' or 'v2', got {version!r}; v2 reads the sub-controller's state.")
+    if version == "v2" and not recurrent:
+        raise ValueError("version='v2' needs recurrent=True: it reads the LSTM state; use version='v1' for hDQN.")
+    sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
+    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
+    num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
+    mask_key = keys.SUBGOAL_MASK if mask_reached and not repeatable_subgoals else None
+    meta_keys = _meta_input_keys(meta_input) if version == "v2" else [keys.OBSERVATION]
+    meta_inputs = len(meta_keys) * architecture.hidden_size if version == "v2" else observation
+
+    sub_controller = SubController(
+        architecture.q_network(
+            observation, num_actions=num_actions, num_conditions=num_subgoals, recurrent=recurrent
+        ),
+        sub_exploration,
+    )
+    meta_controller = MetaController(
+        architecture.q_network(meta_inputs, num_actions=num_subgoals, recurrent=recurrent),
+        meta_exploration,
+        input_keys=meta_keys,
+        mask_key=mask_key,
+    )
+    policy = HierarchicalPolicy(meta_controller, sub_controller).to(env.device)
+    sub_learner = Learner(
+        sub_controller,
+        sub,
+        extract=StepSelector(
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT],
+            next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED],
+            subgoal_key=keys.SUBGOAL,
+        ),
+        loss_keys={
+            "reward": keys.INTRINSIC_REWARD,
+            "done": keys.OPTION_DONE,
+            "terminated": keys.OPTION_TERMINATED,
+            "init": keys.OPTION_INIT,
+        },
+        gamma=gamma,
+        num_envs=env.batch_size[0],
+    )
+    meta_learner = Learner(
+        meta_controller,
+        meta,
+        extract=OptionExtractor(input_keys=meta_keys, mask_key=mask_key),
+        loss_keys={
+            "action": keys.SUBGOAL,
+            "reward": keys.OPTION_RETURN,
+            "steps": keys.OPTION_STEPS if smdp_discount else None,
+            "action_mask": mask_key,
+        },
+        gamma=gamma,
+    )
+
+    def make_transforms() -> Compose:
+        subgoals = SubgoalTransform(
+            num_subgoals,
+            gamma=gamma if smdp_discount else 1.0,
+            max_option_steps=max_option_steps,
+            hazard_reward=hazard_reward,
+            wrong_subgoal_reward=wrong_subgoal_reward,
+            repeatable=repeatable_subgoals,
+        )
+        primers = [controller.make_tensordict_primer() for controller in (sub_controller, meta_controller)]
+        return Compose(InitTracker(), subgoals, *primers)
+
+    return Algorithm(
+        policy=policy,
+        learners={"sub": sub_learner, "meta": meta_learner},
+        explorations={"sub": sub_exploration, "meta": meta_exploration},
+        make_transforms=make_transforms,
+    )
+
+
+make_hdqn = partial(make_hdrqn, version="v1", recurrent=False)
+"""Two levels without memory (h-DQN; Kulkarni et al., 2016); see :func:`make_hdrqn`."""
+
+
+def _meta_input_keys(meta_input: str) -> list[str]:
+    choices = {
+        "hidden": [keys.SUB_HIDDEN],
+        "cell": [keys.SUB_CELL],
+        "both": [keys.SUB_HIDDEN, keys.SUB_CELL],
+    }
+    if meta_input not in choices:
+        raise ValueError(f"meta_input must be one of {list(choices)}, got {meta_input!r}; the paper uses 'hidden'.")
+    return choices[meta_input]

@@ -1,0 +1,85 @@
+"""The two network families that every algorithm can be built from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from torch import nn
+from torchrl.data import Categorical, TensorSpec
+
+from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
+from hdrqn_torchrl.modules.q_network import QNetwork
+
+
+@dataclass(frozen=True, kw_only=True)
+class Architecture:
+    """What a Q-network is made of.
+
+    Args:
+        hidden_size: H, size of the recurrent layer.
+        observation_features: makes the feature extractor for an observation spec.
+        vector_features: makes the feature extractor for a vector of given size (v2's meta-controller).
+    """
+
+    hidden_size: int
+    observation_features: Callable[[TensorSpec], nn.Module]
+    vector_features: Callable[[int], nn.Module]
+
+    def q_network(
+        self, inputs: TensorSpec | int, *, num_actions: int, num_conditions: int = 0, recurrent: bool = True
+    ) -> QNetwork:
+        """A Q-network for an observation spec (without batch dimensions' meaning) or a vector of given size."""
+        make = self.vector_features if isinstance(inputs, int) else self.observation_features
+        return QNetwork(
+            make(inputs),
+            num_actions=num_actions,
+            hidden_size=self.hidden_size,
+            num_conditions=num_conditions,
+            recurrent=recurrent,
+        )
+
+
+def paper_network(hidden_size: int = 256) -> Architecture:
+    """The paper's networks: 44x44x3 image, 4 conv + ReLU (or 4 dense + ReLU on a vector) -> 256 -> LSTM -> dueling.
+
+    Cells are drawn as an image inside the network.
+    """
+
+    def observation_features(spec: TensorSpec) -> nn.Module:
+        if not is_grid(spec):
+            return ConvFeatures(spec.shape[-3], spec.shape[-1])
+        return nn_chain(CellsToImage(spec.shape[-1], spec.n), ConvFeatures())
+
+    return Architecture(
+        hidden_size=hidden_size,
+        observation_features=observation_features,
+        vector_features=lambda size: FullyConnectedFeatures(size, (256, 256, 256, 256)),
+    )
+
+
+def compact_network(hidden_size: int = 64, widths: Sequence[int] = (128,)) -> Architecture:
+    """Small networks on the same information: one-hot cells (or a narrow stack of convolutions) -> LSTM -> dueling."""
+
+    def observation_features(spec: TensorSpec) -> nn.Module:
+        if is_grid(spec):
+            return CellFeatures(spec.shape[-1], spec.n, tuple(widths))
+        return ConvFeatures(spec.shape[-3], spec.shape[-1], widths[-1], channels=(16, 32, 32, 32))
+
+    return Architecture(
+        hidden_size=hidden_size,
+        observation_features=observation_features,
+        vector_features=lambda size: FullyConnectedFeatures(size, tuple(widths)),
+    )
+
+
+def is_grid(spec: TensorSpec) -> bool:
+    """Whether an observation spec is a window of cell codes (otherwise it is an image)."""
+    return isinstance(spec, Categorical)
+
+
+def nn_chain(first: nn.Module, last: nn.Module) -> nn.Module:
+    """``nn.Sequential`` that tells its number of features."""
+    chain = nn.Sequential(first, last)
+    chain.out_features = last.out_features
+    return chain
