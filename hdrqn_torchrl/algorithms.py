@@ -146,9 +146,7 @@ def make_hdrqn(
     meta_inputs = len(meta_keys) * architecture.hidden_size if version == "v2" else observation
 
     sub_controller = SubController(
-        architecture.q_network(
-            observation, num_actions=num_actions, num_conditions=num_subgoals, recurrent=recurrent
-        ),
+        architecture.q_network(observation, num_actions=num_actions, num_conditions=num_subgoals, recurrent=recurrent),
         sub_exploration,
     )
     meta_controller = MetaController(

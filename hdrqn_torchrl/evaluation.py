@@ -35,7 +35,7 @@ class EpisodeTracker:
         Returns:
             The sums ``[N]`` up to and including this step; those of ended episodes are cleared afterwards.
         """
-        step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after.keys()}
+        step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after}
         step["in_order"] = (step["extrinsic"] >= 1.0).float()
         step["steps"] = torch.ones_like(step["return"])
         sums = TensorDict(step, after.batch_size, device=after.device)
@@ -86,7 +86,7 @@ def evaluate(
     return {
         "return_mean": _mean(played["return"]),
         "extrinsic_mean": _mean(played["extrinsic"]),
-        "intrinsic_mean": _mean(played["intrinsic"]) if "intrinsic" in played.keys() else 0.0,
+        "intrinsic_mean": _mean(played["intrinsic"]) if "intrinsic" in played else 0.0,
         "success_rate": _mean(played["success"]),
         "in_order_rate": _mean(played["in_order"]) / num_subgoals,
         "steps_mean": _mean(played["steps"]),

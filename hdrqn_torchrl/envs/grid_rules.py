@@ -99,7 +99,9 @@ class GridRules:
                 f"view must be an odd number of cells >= 1 or None, got {view}; use 3, 5 or None (whole map)."
             )
         if obstacle not in ("stay", "teleport"):
-            raise ValueError(f"obstacle must be 'stay' or 'teleport', got {obstacle!r}; use 'stay' for the default rules.")
+            raise ValueError(
+                f"obstacle must be 'stay' or 'teleport', got {obstacle!r}; use 'stay' for the default rules."
+            )
         is_wall = torch.tensor([[cell == "#" for cell in row] for row in rows]).flatten()
         free = (~is_wall).nonzero().squeeze(-1)
         needed = 1 + num_obstacles + num_goals
@@ -207,7 +209,9 @@ class GridRules:
         collected = state.objects[:, self.num_obstacles :] == self.nowhere
         collected_bits, attained_bits = (collected * self._goal_bits).sum(-1), (attained * self._goal_bits).sum(-1)
         reached = attained_bits > 0
-        in_order = state.in_order & (attained_bits == collected_bits + 1)  # {0..k-1} collected is 2^k - 1, goal k is 2^k
+        in_order = state.in_order & (
+            attained_bits == collected_bits + 1
+        )  # {0..k-1} collected is 2^k - 1, goal k is 2^k
         extrinsic = torch.where(in_order, 1.0, 0.01) * reached
         objects = torch.where(met, self.nowhere, state.objects)
         objects[:, : self.num_obstacles] = state.objects[:, : self.num_obstacles]
@@ -218,7 +222,9 @@ class GridRules:
         events = StepEvents(extrinsic - hazard.float(), extrinsic, hazard, attained, success, all_collected)
         return GridState(agent, objects, in_order | (state.in_order & ~reached)), events
 
-    def _move_hit_obstacles(self, agent: Tensor, objects: Tensor, met: Tensor, generator: torch.Generator | None) -> Tensor:
+    def _move_hit_obstacles(
+        self, agent: Tensor, objects: Tensor, met: Tensor, generator: torch.Generator | None
+    ) -> Tensor:
         hit = met.clone()
         hit[:, self.num_obstacles :] = False
         worlds = hit.any(-1).nonzero().squeeze(-1)

@@ -9,18 +9,10 @@ those they are the shortest.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Literal
-
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import step_mdp
 
-from hdrqn_torchrl import keys
-from hdrqn_torchrl.envs.cells import FIRST_GOAL, OBSTACLE
 from hdrqn_torchrl.envs.grid_rules import ACTIONS
-from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
 
 _LOSS = 1000.0  # cost of a lost unit of reward, in steps: more than the longest path
 _UNSEEN = 255  # code of a cell that the memory player has not seen yet

@@ -44,7 +44,7 @@ class _RestartingLSTM(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad):  # noqa: ANN001, ANN205
         inputs, keep, weight_ih, weight_hh, gates, *saved = ctx.saved_tensors
-        time, size = len(inputs), grad.shape[-1]
+        time = len(inputs)
         before, cells, squashed = saved[:time], saved[time : 2 * time], saved[2 * time :]
         grad_gates = torch.empty_like(gates)
         grad_hidden = grad_cell = torch.zeros_like(grad[0])

@@ -108,8 +108,10 @@ class RecurrentDQNLoss(LossModule):
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
         # Both networks as they are called, outside the module tree: their parameters are those registered above.
         # Calling them directly saves two parameter swaps an update.
-        target = deepcopy(value_network)
-        self.target_value_network_params.to_module(target, preserve_module_state=False)
+        target = value_network
+        if delay_value:
+            target = deepcopy(value_network)
+            self._modules["target_value_network_params"].to_module(target, preserve_module_state=False)
         self.__dict__["_networks"] = (value_network, target)
         self.register_buffer("gamma", torch.tensor(gamma))
         self.burn_in, self.train_exact_states = burn_in, train_exact_states

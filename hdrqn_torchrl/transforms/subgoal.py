@@ -194,9 +194,7 @@ class SubgoalTransform(Transform):
         flags = [self.option_init_key, *self._reported]
         return {
             **{key: Binary(shape=one, dtype=torch.bool, device=device) for key in flags},
-            self.active_subgoal_key: Categorical(
-                self.num_subgoals, shape=batch_size, dtype=torch.int64, device=device
-            ),
+            self.active_subgoal_key: Categorical(self.num_subgoals, shape=batch_size, dtype=torch.int64, device=device),
             self.subgoal_mask_key: Binary(shape=per_subgoal, dtype=torch.bool, device=device),
             self.option_steps_key: Unbounded(shape=one, dtype=torch.int64, device=device),
             self.option_return_key: Unbounded(shape=one, dtype=torch.float32, device=device),

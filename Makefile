@@ -1,0 +1,34 @@
+# `make train` and `make test` set everything up by themselves in .venv.
+PYTHON ?= python3.11
+BIN := .venv/bin
+ARGS ?=
+
+.PHONY: setup train test test-slow lint examples clean
+
+setup: .venv/.ready
+
+.venv/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	touch $@
+
+train: setup
+	$(BIN)/python train.py env=gridworld algo=v2 $(ARGS)
+
+test: setup lint examples
+	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+examples: setup
+	$(BIN)/python examples/reuse_transform.py --frames 2000
+	$(BIN)/python examples/reuse_loss.py --updates 60
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,124 @@
+"""Where the numbers of a run go: one CSV row per log point, TensorBoard scalars, a progress line."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from torchrl.record.loggers.common import Logger
+
+Row = dict[str, float]
+
+
+class CSVLog:
+    """``metrics.csv``: one row per log point. A column that appears later is added to the header.
+
+    TorchRL's ``CSVLogger`` writes one file per scalar; a run is easier to read as one table.
+
+    Args:
+        path: the file; rows are appended to what it holds.
+
+    Examples:
+        >>> import tempfile
+        >>> log = CSVLog(Path(tempfile.mkdtemp()) / "metrics.csv")
+        >>> log.write({"frames": 1, "loss": 0.5})
+        >>> log.path.read_text().split()
+        ['frames,loss', '1,0.5']
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.columns = path, list[str]()
+        if path.exists():
+            self.columns = path.read_text().split("\n", 1)[0].split(",")
+
+    def write(self, row: Row) -> None:
+        """Appends one row; it is on the disk when this returns."""
+        if new := [name for name in row if name not in self.columns]:
+            self._widen(new)
+        with self.path.open("a", newline="") as file:
+            csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(row)
+
+    def _widen(self, new: list[str]) -> None:
+        rows = []
+        if self.path.exists():
+            with self.path.open(newline="") as file:
+                rows = list(csv.DictReader(file))
+        self.columns += new
+        partial = self.path.with_suffix(".partial")
+        with partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self.columns, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        partial.replace(self.path)
+
+
+class RunLogger:
+    """Sends each log point to the CSV file, to TorchRL loggers and to the terminal.
+
+    Args:
+        folder: run folder.
+        total_frames: end of the progress bar.
+        loggers: any TorchRL loggers (TensorBoard, W&B, ...); scalars are logged under their column's name.
+        console: where progress goes; a terminal shows a bar, anything else a line per greedy evaluation.
+    """
+
+    def __init__(
+        self, folder: Path, *, total_frames: int, loggers: list[Logger] | None = None, console: Console | None = None
+    ) -> None:
+        self.csv, self.loggers = CSVLog(folder / "metrics.csv"), loggers or []
+        self.console = console or Console(file=sys.stderr)
+        self._progress = Progress(
+            TextColumn("{task.percentage:>3.0f}%"),
+            BarColumn(bar_width=20),
+            TaskProgressColumn(text_format="{task.completed:,.0f}/{task.total:,.0f} frames", show_speed=False),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[numbers]}"),
+            console=self.console,
+            disable=not self.console.is_terminal,
+        )
+        self._task = self._progress.add_task("training", total=total_frames, numbers="")
+        self._progress.start()
+        self._last_greedy = ""
+
+    def log(self, row: Row) -> None:
+        """Writes one log point; ``row["frames"]`` is its position."""
+        self.csv.write(row)
+        frames = int(row["frames"])
+        for logger in self.loggers:
+            for name, value in row.items():
+                logger.log_scalar(name, value, step=frames)
+        evaluated = "greedy/return" in row
+        if evaluated:
+            ceiling = f" of {row['greedy/ceiling']:.2f}" if "greedy/ceiling" in row else ""
+            success = row["greedy/success"]
+            self._last_greedy = f"greedy {row['greedy/return']:+.2f}{ceiling}, success {success:.0%}"
+        numbers = progress_line(row, self._last_greedy)
+        self._progress.update(self._task, completed=frames, numbers=numbers)
+        if evaluated and not self.console.is_terminal:
+            self.console.print(f"{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
+
+    def close(self) -> None:
+        """Stops the progress bar."""
+        self._progress.stop()
+
+
+def progress_line(row: Row, greedy: str) -> str:
+    """Speed, behaviour, greedy result and epsilons in one line."""
+    updates = sum(value for name, value in row.items() if name.endswith("/updates_per_second"))
+    epsilons = [
+        f"{name.removesuffix('/epsilon')} {value:.2f}" for name, value in row.items() if name.endswith("/epsilon")
+    ]
+    parts = [f"{row.get('frames_per_second', 0):,.0f} frames/s, {updates:,.0f} updates/s"]
+    if "behaviour/return" in row:
+        parts.append(f"behaviour {row['behaviour/return']:+.2f}")
+    return " | ".join([*parts, greedy, "epsilon " + ", ".join(epsilons)])
+
+
+def make_tensorboard_logger(folder: Path) -> Logger:
+    """TorchRL's TensorBoard logger, writing to ``folder/tensorboard``."""
+    from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+    return TensorboardLogger("tensorboard", log_dir=str(folder))
