@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
+import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
@@ -99,6 +101,7 @@ def make_hdrqn(
     gamma: float = 0.99,
     smdp_discount: bool = True,
     meta_input: Literal["hidden", "cell", "both"] = "hidden",
+    meta_input_time: Literal["after_last_decision", "after_last_observation"] = "after_last_decision",
     mask_reached: bool = True,
     repeatable_subgoals: bool = False,
     wrong_subgoal_reward: float = 0.0,
@@ -118,6 +121,7 @@ def make_hdrqn(
         smdp_discount: discount the option's return inside the option and what follows by :math:`\gamma^k`;
             ``False``: plain sum and :math:`\gamma`.
         meta_input: which part of the LSTM state v2 reads.
+        meta_input_time: whether that state includes the observation in which the last option ended.
         mask_reached: let the meta-controller choose only among subgoals not yet attained.
         repeatable_subgoals: whether subgoals can be attained again (then nothing is masked).
         wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one.
@@ -138,6 +142,11 @@ def make_hdrqn(
         raise ValueError(f"version must be 'v1' or 'v2', got {version!r}; v2 reads the sub-controller's state.")
     if version == "v2" and not recurrent:
         raise ValueError("version='v2' needs recurrent=True: it reads the LSTM state; use version='v1' for hDQN.")
+    if meta_input_time not in ("after_last_decision", "after_last_observation"):
+        raise ValueError(
+            f"meta_input_time must be 'after_last_decision' or 'after_last_observation', got {meta_input_time!r}; "
+            "the paper's Algorithm 1 has the former."
+        )
     sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
     observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
@@ -155,7 +164,8 @@ def make_hdrqn(
         input_keys=meta_keys,
         mask_key=mask_key,
     )
-    policy = HierarchicalPolicy(meta_controller, sub_controller).to(env.device)
+    reads_last = version == "v2" and meta_input_time == "after_last_observation"
+    policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
     sub_learner = Learner(
         sub_controller,
         sub,
@@ -176,7 +186,9 @@ def make_hdrqn(
     meta_learner = Learner(
         meta_controller,
         meta,
-        extract=OptionExtractor(input_keys=meta_keys, mask_key=mask_key),
+        extract=OptionExtractor(
+            input_keys=meta_keys, mask_key=mask_key, at_end=partial(_read_last, sub_controller) if reads_last else None
+        ),
         loss_keys={
             "action": keys.SUBGOAL,
             "reward": keys.OPTION_RETURN,
@@ -208,6 +220,13 @@ def make_hdrqn(
 
 make_hdqn = partial(make_hdrqn, version="v1", recurrent=False)
 """Two levels without memory (h-DQN; Kulkarni et al., 2016); see :func:`make_hdrqn`."""
+
+
+@torch.no_grad()
+def _read_last(sub_controller: SubController, after: TensorDictBase) -> TensorDictBase:
+    """Advances the LSTM state at the end of options by the observation that they ended in."""
+    hidden, cell = sub_controller.advance(after)
+    return after.set(sub_controller.hidden_key, hidden).set(sub_controller.cell_key, cell)
 
 
 def _meta_input_keys(meta_input: str) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -28,6 +28,8 @@ class OptionExtractor:
             :class:`~hdrqn_torchrl.transforms.SubgoalTransform`.
         init_key: first step of an episode.
         traj_key: number of the episode.
+        at_end: changes the entries ``[M]`` of the steps at which options ended before they are kept; for inputs
+            that the environment's step does not hold.
 
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -55,7 +57,9 @@ class OptionExtractor:
         active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
         init_key: NestedKey = keys.IS_INIT,
         traj_key: NestedKey = keys.TRAJ_IDS,
+        at_end: Callable[[TensorDictBase], TensorDictBase] | None = None,
     ) -> None:
+        self.at_end = at_end
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
         self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
         inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
@@ -94,6 +98,8 @@ class OptionExtractor:
         environment, end_time = ended.nonzero(as_tuple=True)
         options = starts[started]
         after = batch.get("next")[environment, end_time]
+        if self.at_end is not None:
+            after = self.at_end(after)
         options.set(self.subgoal_key, after.get(self.active_subgoal_key))
         options.set("next", after.select(*self._end_keys))
         return options.set("environment", environment)

@@ -20,7 +20,7 @@ from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy
-from hdrqn_torchrl.modules.q_network import QNetwork
+from hdrqn_torchrl.modules.q_network import QNetwork, State
 
 
 class SubController(TensorDictModuleBase):
@@ -97,6 +97,20 @@ class SubController(TensorDictModuleBase):
         tensordict.set(self.action_key, self.exploration(value))
         tensordict.set(_next(self.hidden_key), hidden)
         return tensordict.set(_next(self.cell_key), cell)
+
+    def advance(self, tensordict: TensorDictBase, subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL) -> State:
+        """LSTM state after one more observation, without a decision.
+
+        Args:
+            tensordict: holds observation and LSTM state.
+            subgoal_key: the subgoal that was pursued.
+
+        Returns:
+            Hidden and cell state ``[*batch, H]``.
+        """
+        state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
+        subgoal = None if self.subgoal_key is None else tensordict.get(subgoal_key)
+        return self.network.step(tensordict.get(self.observation_key), subgoal, state)[1]
 
 
 class MetaController(TensorDictModuleBase):
@@ -187,17 +201,37 @@ class HierarchicalPolicy(TensorDictModuleBase):
     Args:
         meta_controller: writes the subgoal.
         sub_controller: reads it and writes the action.
+        read_last_observation: before a new option, advance the sub-controller's state by the observation in
+            which the last one ended, so that v2's meta-controller reads it, too. ``False`` is Algorithm 1 as
+            written: the state after the last decision.
+        init_key: first step of an episode ``[1]`` bool; read if ``read_last_observation``.
     """
 
-    def __init__(self, meta_controller: MetaController, sub_controller: SubController) -> None:
+    def __init__(
+        self,
+        meta_controller: MetaController,
+        sub_controller: SubController,
+        *,
+        read_last_observation: bool = False,
+        init_key: NestedKey = keys.IS_INIT,
+    ) -> None:
         super().__init__()
         self.meta_controller, self.sub_controller = meta_controller, sub_controller
+        self.read_last_observation, self.init_key = read_last_observation, init_key
         made = [key for key in meta_controller.out_keys if key in sub_controller.in_keys]
         wanted = [*meta_controller.acting_keys, *meta_controller.in_keys, *sub_controller.in_keys]
+        if read_last_observation:
+            wanted.append(init_key)
         self.in_keys = list(dict.fromkeys(key for key in wanted if key not in made))
         self.out_keys = [*meta_controller.out_keys, *sub_controller.out_keys]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self.read_last_observation:
+            meta, sub = self.meta_controller, self.sub_controller
+            ended = tensordict.get(meta.gate_key) & ~tensordict.get(self.init_key)
+            advanced = sub.advance(tensordict, meta.active_subgoal_key)
+            for key, value in zip((sub.hidden_key, sub.cell_key), advanced, strict=True):
+                tensordict.set(key, torch.where(ended, value, tensordict.get(key)))
         return self.sub_controller(self.meta_controller(tensordict))
 
 

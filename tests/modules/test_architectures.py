@@ -1,0 +1,75 @@
+import pytest
+import torch
+from helpers import small_env
+from torch import nn
+from torchrl.data import Bounded
+
+from hdrqn_torchrl.modules import compact_network, paper_network
+from hdrqn_torchrl.modules.architectures import is_grid
+
+IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
+
+
+@pytest.fixture(params=["grid", "image", "vector"])
+def inputs(request):
+    """A spec (or size) and a batch of two sequences of three inputs that fits it."""
+    if request.param == "grid":
+        spec = small_env(4, view=5).observation_spec["observation"]
+        return spec, torch.randint(5, (2, 3, 5, 5), dtype=torch.uint8)
+    if request.param == "image":
+        return IMAGE, torch.randint(256, (2, 3, 3, 44, 44), dtype=torch.uint8)
+    return 16, torch.randn(2, 3, 16)
+
+
+@pytest.mark.parametrize("make", [compact_network, paper_network])
+@pytest.mark.parametrize("recurrent", [True, False])
+def test_every_architecture_reads_every_kind_of_input(make, recurrent, inputs):
+    spec, batch = inputs
+    architecture = make(hidden_size=12)
+    network = architecture.q_network(spec, num_actions=4, num_conditions=2, recurrent=recurrent)
+    values = network.unroll(batch, torch.zeros(2, 3, dtype=torch.int64))
+    assert values.shape == (2, 3, 4) and network.hidden_size == architecture.hidden_size == 12
+    assert isinstance(network.memory, nn.LSTM) == recurrent
+
+
+def layers(network):
+    kinds = (nn.Conv2d, nn.Linear, nn.LSTM)
+    return [type(module).__name__ for module in network.modules() if isinstance(module, kinds)]
+
+
+def test_the_papers_network_on_images():
+    network = paper_network().q_network(IMAGE, num_actions=4, num_conditions=2)
+    assert layers(network) == ["Conv2d"] * 4 + ["Linear", "LSTM", "Linear"]
+    assert network.features.out_features == network.hidden_size == 256
+    assert network.memory.input_size == 256 + 2
+
+
+def test_the_papers_network_on_a_hidden_state():
+    network = paper_network().q_network(256, num_actions=2)
+    assert layers(network) == ["Linear"] * 4 + ["LSTM", "Linear"]
+    assert network.memory.input_size == 256
+
+
+def test_the_papers_network_draws_cells_as_a_44x44_image():
+    spec = small_env(4, view=5).observation_spec["observation"]
+    network = paper_network().q_network(spec, num_actions=4)
+    image = network.features[0](torch.zeros(1, 5, 5, dtype=torch.uint8))
+    assert image.shape == (1, 3, 44, 44) and layers(network)[:4] == ["Conv2d"] * 4
+
+
+def test_sizes_of_the_compact_network():
+    spec = small_env(4, view=3).observation_spec["observation"]
+    network = compact_network(hidden_size=10, widths=[7, 5]).q_network(spec, num_actions=4)
+    shapes = [tuple(layer.weight.shape) for layer in network.features.modules() if isinstance(layer, nn.Linear)]
+    assert shapes == [(7, 3 * 3 * 5), (5, 7)]
+    assert (network.memory.input_size, network.memory.hidden_size) == (5, 10)
+
+
+def test_each_network_has_weights_of_its_own():
+    architecture = compact_network(4, (4,))
+    first, second = (architecture.q_network(6, num_actions=2) for _ in range(2))
+    assert not {id(p) for p in first.parameters()} & {id(p) for p in second.parameters()}
+
+
+def test_is_grid():
+    assert is_grid(small_env().observation_spec["observation"]) and not is_grid(IMAGE)

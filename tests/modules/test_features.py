@@ -1,0 +1,81 @@
+import pytest
+import torch
+
+from hdrqn_torchrl.envs.cells import palette
+from hdrqn_torchrl.modules import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
+
+
+class TestCellsToImage:
+    def test_every_pixel_has_the_colour_of_its_cell(self):
+        cells = torch.tensor([[0, 1], [2, 3]], dtype=torch.uint8)
+        image = CellsToImage(view=2, num_codes=4, size=6)(cells)
+        for row in range(6):
+            for column in range(6):
+                code = cells[row // 3, column // 3].long()
+                assert image[:, row, column].tolist() == pytest.approx((palette(4)[code] / 255).tolist())
+
+    def test_cells_share_uneven_pixels_in_order(self):
+        cells = torch.arange(3, dtype=torch.uint8).repeat(3, 1)
+        row = CellsToImage(view=3, num_codes=3, size=44)(cells)[:, 0]
+        codes = [(palette(3).t() / 255 == row[:, [x]]).all(0).nonzero().item() for x in range(44)]
+        assert codes == sorted(codes) and [codes.count(code) for code in range(3)] == [15, 15, 14]
+
+    def test_any_leading_dimensions(self):
+        cells = torch.randint(5, (2, 3, 5, 5), dtype=torch.uint8)
+        draw = CellsToImage(view=5, num_codes=5)
+        assert draw(cells).shape == (2, 3, 3, 44, 44)
+        assert (draw(cells)[1, 2] == draw(cells[1, 2])).all()
+
+
+class TestConvFeatures:
+    def test_bytes_and_floats_of_the_same_image_agree(self):
+        torch.manual_seed(0)
+        features, image = ConvFeatures(channels=(4, 4, 4, 4)), torch.randint(256, (2, 3, 44, 44), dtype=torch.uint8)
+        torch.testing.assert_close(features(image), features(image.float() / 255))
+
+    @pytest.mark.parametrize("leading", [(), (2,), (2, 3)])
+    def test_any_leading_dimensions(self, leading):
+        torch.manual_seed(0)
+        features = ConvFeatures(out_features=7, channels=(4, 4, 4, 4))
+        image = torch.rand(*leading, 3, 44, 44)
+        assert features(image).shape == (*leading, 7)
+        expected = features(image[(0,) * len(leading)])
+        torch.testing.assert_close(features(image)[(0,) * len(leading)], expected)
+
+    def test_it_is_four_convolutions_and_a_dense_layer_each_with_relu(self):
+        kinds = [type(layer).__name__ for layer in ConvFeatures().modules() if not list(layer.children())]
+        assert kinds == ["Conv2d", "ReLU"] * 4 + ["Flatten", "Linear", "ReLU"]
+        assert ConvFeatures().out_features == 256
+
+    @pytest.mark.parametrize("size", [38, 44, 84])
+    def test_sizes_that_fit(self, size):
+        assert ConvFeatures(1, size, 5, channels=(2, 2, 2, 2))(torch.zeros(1, 1, size, size)).shape == (1, 5)
+
+    def test_an_image_that_is_too_small(self):
+        with pytest.raises(ValueError, match="size must be >= 38 pixels.*got 37; use 44"):
+            ConvFeatures(size=37)
+
+
+class TestVectors:
+    def test_cell_features_see_code_and_place_of_every_cell(self):
+        torch.manual_seed(0)
+        features = CellFeatures(view=3, num_codes=5, widths=(64,))
+        seen = {tuple(features(torch.zeros(3, 3, dtype=torch.uint8)).tolist())}
+        for place in range(9):
+            for code in range(1, 5):
+                cells = torch.zeros(9, dtype=torch.uint8)
+                cells[place] = code
+                seen.add(tuple(features(cells.view(3, 3)).tolist()))
+        assert len(seen) == 1 + 9 * 4
+
+    def test_cell_features_take_any_leading_dimensions(self):
+        features = CellFeatures(view=3, num_codes=5, widths=(6, 4))
+        cells = torch.randint(5, (2, 7, 3, 3), dtype=torch.uint8)
+        assert features(cells).shape == (2, 7, 4) and features.out_features == 4
+        torch.testing.assert_close(features(cells)[1, 6], features(cells[1, 6]))
+
+    def test_fully_connected_features_are_the_papers_four_layers(self):
+        features = FullyConnectedFeatures(10)
+        shapes = [tuple(p.shape) for p in features.parameters() if p.ndim == 2]
+        assert shapes == [(256, 10), (256, 256), (256, 256), (256, 256)]
+        assert features(torch.zeros(2, 3, 10)).shape == (2, 3, features.out_features)

@@ -1,0 +1,90 @@
+import pytest
+import torch
+from helpers import unroll_by_steps
+
+from hdrqn_torchrl.modules import DuelingHead, FullyConnectedFeatures, QNetwork
+
+
+def make_network(**settings):
+    torch.manual_seed(0)
+    defaults = {"num_actions": 4, "hidden_size": 6}
+    return QNetwork(FullyConnectedFeatures(5, (8,)), **(defaults | settings))
+
+
+def test_dueling_adds_the_centred_advantage_to_the_value():
+    head = DuelingHead(1, 3)
+    with torch.no_grad():
+        head.streams.weight.copy_(torch.tensor([[10.0], [1.0], [2.0], [6.0]]))
+        head.streams.bias.zero_()
+    assert head(torch.tensor([1.0])).tolist() == [8.0, 9.0, 13.0]  # 10 + advantage - 3
+
+
+@pytest.mark.parametrize("recurrent", [True, False])
+@pytest.mark.parametrize("num_conditions", [0, 3])
+@pytest.mark.parametrize("restarts", [False, True])
+def test_unroll_equals_a_loop_over_steps(recurrent, num_conditions, restarts):
+    network = make_network(recurrent=recurrent, num_conditions=num_conditions)
+    observation = torch.randn(3, 7, 5)
+    condition = torch.randint(num_conditions, (3, 7)) if num_conditions else None
+    init = (torch.rand(3, 7) < 0.3) if restarts else None
+    values = network.unroll(observation, condition, init)
+    torch.testing.assert_close(values, unroll_by_steps(network, observation, condition, init))
+
+
+def test_a_restart_forgets_what_came_before_and_nothing_else_does():
+    network, observation = make_network(), torch.randn(1, 6, 5)
+    changed = observation.clone()
+    changed[:, 1] += 1.0
+    init = torch.tensor([[False, False, False, True, False, False]])
+    difference = (network.unroll(observation, None, init) - network.unroll(changed, None, init)).abs().sum(-1)[0]
+    assert (difference > 0).tolist() == [False, True, True, False, False, False]
+    difference = (network.unroll(observation) - network.unroll(changed)).abs().sum(-1)[0]
+    assert (difference > 0).tolist() == [False, True, True, True, True, True]
+
+
+def test_rows_of_a_batch_do_not_touch_each_other():
+    network, observation = make_network(), torch.randn(3, 6, 5)
+    changed = observation.clone()
+    changed[0] += 1.0
+    init = torch.zeros(3, 6, dtype=torch.bool)
+    init[1, 3] = True
+    for flags in (None, init):
+        before, after = network.unroll(observation, None, flags), network.unroll(changed, None, flags)
+        assert (before[0] != after[0]).any()
+        assert (before[1:] == after[1:]).all()
+
+
+def test_the_condition_changes_the_values():
+    network, observation = make_network(num_conditions=2), torch.randn(1, 5)
+    state = network.initial_state(1)
+    first, second = (network.step(observation, torch.tensor([g]), state)[0] for g in (0, 1))
+    assert (first != second).all()
+
+
+def test_one_decision_needs_no_batch():
+    network, observation = make_network(), torch.randn(5)
+    value, (hidden, cell) = network.step(observation, None, network.initial_state())
+    batched, (batched_hidden, batched_cell) = network.step(observation[None], None, network.initial_state(1))
+    assert value.shape == (4,) and hidden.shape == cell.shape == (6,)
+    for single, several in ((value, batched), (hidden, batched_hidden), (cell, batched_cell)):
+        torch.testing.assert_close(single, several[0])
+
+
+def test_without_recurrence_the_state_passes_through_and_the_past_does_not_matter():
+    network, state = make_network(recurrent=False), (torch.ones(2, 6), torch.ones(2, 6))
+    value, after = network.step(torch.randn(2, 5), None, state)
+    assert value.shape == (2, 4) and after is state
+    observation = torch.randn(1, 4, 5)
+    torch.testing.assert_close(network.unroll(observation)[:, 2:], network.unroll(observation[:, 2:]))
+
+
+def test_the_initial_state_is_zero():
+    hidden, cell = make_network().initial_state(2, 3)
+    assert hidden.shape == cell.shape == (2, 3, 6) and not hidden.any() and not cell.any()
+    hidden.add_(1.0)
+    assert not cell.any()
+
+
+def test_wrong_hidden_size():
+    with pytest.raises(ValueError, match="hidden_size must be >= 1, got 0; "):
+        make_network(hidden_size=0)
