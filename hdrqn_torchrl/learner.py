@@ -32,6 +32,8 @@ class LearnerSettings:
         burn_in: share of a sequence left out of the loss at its beginning.
         train_exact_states: train leading steps whose recurrent state is exact (see
             :func:`~hdrqn_torchrl.objectives.training_mask`).
+        sampling: how sequences are drawn, ``"steps"`` or ``"episodes"`` (see
+            :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
 
@@ -49,6 +51,7 @@ class LearnerSettings:
     max_grad_norm: float | None = None
     burn_in: float = 0.5
     train_exact_states: bool = True
+    sampling: Literal["steps", "episodes"] = "steps"
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
 
@@ -114,6 +117,7 @@ class Learner:
             slice_len=settings.slice_len,
             batch_size=settings.batch_size * samples_per_draw,
             num_envs=num_envs,
+            sampling=settings.sampling,
             device=self._parameters[0].device,
         )
         self._drawn: list[TensorDictBase] = []

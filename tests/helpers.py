@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
@@ -89,9 +89,6 @@ def unroll_by_steps(network, observation, condition=None, init=None):
 
 def parameter_distance(first: TensorDictBase, second: TensorDictBase) -> float:
     """Largest absolute difference between two sets of parameters."""
-    return max((a - b).abs().max().item() for a, b in zip(_leaves(first), _leaves(second), strict=True))
-
-
-def _leaves(params: TensorDictBase) -> list[torch.Tensor]:
-    flat = TensorDict(dict(params.items(True, True)), [])
-    return [flat[key].detach() for key in sorted(flat.keys(), key=str)]
+    first, second = (dict(params.items(True, True)) for params in (first, second))
+    assert first.keys() == second.keys()
+    return max((first[key] - second[key]).abs().max().item() for key in first if first[key].numel())

@@ -1,6 +1,6 @@
 """From collected steps to replayed sequences."""
 
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
-from hdrqn_torchrl.data.replay import make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data.replay import StepSliceSampler, make_sequence_buffer, sample_sequences
 
-__all__ = ["OptionExtractor", "StepSelector", "make_sequence_buffer", "sample_sequences"]
+__all__ = ["OptionExtractor", "StepSelector", "StepSliceSampler", "make_sequence_buffer", "sample_sequences"]

@@ -2,10 +2,65 @@
 
 from __future__ import annotations
 
+from typing import Any, Literal
+
+import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torch import Tensor
+from torchrl.data import LazyTensorStorage, SliceSampler, Storage, TensorDictReplayBuffer
 
 from hdrqn_torchrl import keys
+
+Sampling = Literal["steps", "episodes"]
+
+
+class StepSliceSampler(SliceSampler):
+    """Slices that start at a uniformly random *step*; TorchRL's ``SliceSampler`` picks an episode first.
+
+    How long an episode lasts depends on what happened in it. To pick episodes uniformly shows each step of a
+    short (say, successful) episode more often than it occurs, and shows its last steps less often than those in
+    its middle; Q-values of a stochastic task are then biased. Here whether a step is shown depends on its past
+    only. A slice that meets the end of its episode is padded and ``("collector", "mask")`` tells its real steps.
+
+    Args:
+        slice_len: steps of a slice.
+        traj_key: entry that numbers the episodes.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> sampler = StepSliceSampler(slice_len=4, traj_key="episode")
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=8)
+        >>> _ = buffer.extend(TensorDict(episode=torch.tensor([0, 0, 0, 1, 1]), batch_size=5))
+        >>> buffer.sample().reshape(2, 4)["collector", "mask"].shape
+        torch.Size([2, 4])
+    """
+
+    def __init__(self, *, slice_len: int, traj_key: NestedKey = keys.TRAJ_IDS) -> None:
+        super().__init__(
+            slice_len=slice_len,
+            traj_key=traj_key,
+            truncated_key=None,
+            init_key=None,
+            cache_values=True,
+            strict_length=False,
+            pad_output=True,
+        )
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
+        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
+        length, count = self._adjusted_batch_size(batch_size)
+        ends = lengths.cumsum(0)
+        step = torch.randint(int(ends[-1]), (count,), device=ends.device, generator=self._rng)
+        episode = torch.searchsorted(ends, step, right=True)
+        left = ends[episode] - step  # real steps from the start of the slice on
+        offset = torch.arange(length, device=ends.device)
+        mask = offset < left.unsqueeze(-1)  # [B, T]
+        time = first[episode, 0] + lengths[episode] - left
+        time = time.unsqueeze(-1) + torch.minimum(offset, left.unsqueeze(-1) - 1)  # padding repeats the last step
+        index = [(time % storage.shape[0]).flatten()]
+        index += [place.repeat_interleave(length) for place in first[episode, 1:].unbind(-1)]
+        return tuple(index), {keys.PAD_MASK: mask.flatten()}
 
 
 def make_sequence_buffer(
@@ -14,13 +69,14 @@ def make_sequence_buffer(
     slice_len: int,
     batch_size: int,
     num_envs: int | None = None,
+    sampling: Sampling = "steps",
     traj_key: NestedKey = keys.TRAJ_IDS,
-    device: str = "cpu",
+    device: torch.device | str = "cpu",
 ) -> TensorDictReplayBuffer:
-    """A TorchRL replay buffer from which random slices of random episodes are drawn ("bootstrapped random updates").
+    """A TorchRL replay buffer from which random slices of episodes are drawn ("bootstrapped random updates").
 
-    An episode is chosen uniformly, then a start in it uniformly. Episodes shorter than ``slice_len`` are not
-    dropped: they are padded and ``("collector", "mask")`` tells which steps are real.
+    Trajectories shorter than ``slice_len`` are not dropped: they are padded and ``("collector", "mask")`` tells
+    which steps are real.
 
     Args:
         capacity: number of transitions kept.
@@ -28,6 +84,8 @@ def make_sequence_buffer(
         batch_size: number of sequences of a sample.
         num_envs: N if the buffer is extended by collected batches ``[N, T]`` with T >= 2 (steps); ``None`` if by rows
             ``[M]`` that keep each episode together (options).
+        sampling: ``"steps"``: every step is equally likely to start a slice (:class:`StepSliceSampler`);
+            ``"episodes"``: a random episode, then a random start in it, as the paper describes it.
         traj_key: entry that numbers the episodes.
         device: device of the storage.
 
@@ -35,7 +93,11 @@ def make_sequence_buffer(
         The buffer; sample from it with :func:`sample_sequences`.
 
     Raises:
-        ValueError: if a number breaks its rule.
+        ValueError: if an argument breaks its rule.
+
+    Examples:
+        >>> make_sequence_buffer(1000, slice_len=8, batch_size=32, num_envs=4).sampler
+        StepSliceSampler(...)
     """
     if slice_len < 1:
         raise ValueError(f"slice_len must be >= 1, got {slice_len}; use 1 for a feed-forward network.")
@@ -46,16 +108,22 @@ def make_sequence_buffer(
             f"capacity must hold at least slice_len={slice_len} transitions of each of {num_envs or 1} environments, "
             f"got {capacity}; the paper keeps 100,000 steps and 50,000 options."
         )
-    return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
-        sampler=SliceSampler(
+    if sampling == "steps":
+        sampler = StepSliceSampler(slice_len=slice_len, traj_key=traj_key)
+    elif sampling == "episodes":
+        sampler = SliceSampler(
             slice_len=slice_len,
             traj_key=traj_key,
             init_key=None,  # keep the stored flag: it tells true starts of episodes
             cache_values=True,
             strict_length=False,
             pad_output=True,
-        ),
+        )
+    else:
+        raise ValueError(f"sampling must be 'steps' or 'episodes', got {sampling!r}; the paper's is 'episodes'.")
+    return TensorDictReplayBuffer(
+        storage=LazyTensorStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
+        sampler=sampler,
         batch_size=batch_size * slice_len,
     )
 

@@ -20,9 +20,11 @@ class Architecture:
         hidden_size: H, size of the recurrent layer.
         observation_features: makes the feature extractor for an observation spec.
         vector_features: makes the feature extractor for a vector of given size (v2's meta-controller).
+        gate_features: whether the subgoal scales the features beside being appended to them.
     """
 
     hidden_size: int
+    gate_features: bool = False
     observation_features: Callable[[TensorSpec], nn.Module]
     vector_features: Callable[[int], nn.Module]
 
@@ -36,14 +38,19 @@ class Architecture:
             num_actions=num_actions,
             hidden_size=self.hidden_size,
             num_conditions=num_conditions,
+            gate_features=self.gate_features,
             recurrent=recurrent,
         )
 
 
-def paper_network(hidden_size: int = 256) -> Architecture:
+def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Architecture:
     """The paper's networks: 44x44x3 image, 4 conv + ReLU (or 4 dense + ReLU on a vector) -> 256 -> LSTM -> dueling.
 
     Cells are drawn as an image inside the network.
+
+    Args:
+        hidden_size: H, size of the LSTM.
+        gate_features: whether the subgoal scales the features beside being appended to them.
     """
 
     def observation_features(spec: TensorSpec) -> nn.Module:
@@ -53,13 +60,22 @@ def paper_network(hidden_size: int = 256) -> Architecture:
 
     return Architecture(
         hidden_size=hidden_size,
+        gate_features=gate_features,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, (256, 256, 256, 256)),
     )
 
 
-def compact_network(hidden_size: int = 64, widths: Sequence[int] = (128,)) -> Architecture:
-    """Small networks on the same information: one-hot cells (or a narrow stack of convolutions) -> LSTM -> dueling."""
+def compact_network(
+    hidden_size: int = 64, widths: Sequence[int] = (128,), *, gate_features: bool = True
+) -> Architecture:
+    """Small networks on the same information: one-hot cells (or a narrow stack of convolutions) -> LSTM -> dueling.
+
+    Args:
+        hidden_size: H, size of the LSTM.
+        widths: sizes of the dense layers.
+        gate_features: whether the subgoal scales the features beside being appended to them.
+    """
 
     def observation_features(spec: TensorSpec) -> nn.Module:
         if is_grid(spec):
@@ -68,6 +84,7 @@ def compact_network(hidden_size: int = 64, widths: Sequence[int] = (128,)) -> Ar
 
     return Architecture(
         hidden_size=hidden_size,
+        gate_features=gate_features,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, tuple(widths)),
     )

@@ -67,21 +67,21 @@ class ConvFeatures(nn.Module):
         super().__init__()
         kernels_and_strides = ((5, 2), (3, 2), (3, 2), (3, 1))
         layers: list[nn.Module] = []
-        previous = in_channels
+        previous, side = in_channels, size
         for width, (kernel, stride) in zip(channels, kernels_and_strides, strict=True):
             layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU()]
-            previous, size = width, (size - kernel) // stride + 1
-        if size < 1:
-            raise ValueError("size must be >= 38 pixels for four convolutions; use 44 as the paper does.")
+            previous, side = width, (side - kernel) // stride + 1
+        if side < 1:
+            raise ValueError(f"size must be >= 33 pixels for four convolutions, got {size}; the paper uses 44.")
         self.convolutions = nn.Sequential(*layers)
-        self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * size * size, out_features), nn.ReLU())
+        self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU())
         self.out_features = out_features
 
     def forward(self, image: Tensor) -> Tensor:
         if image.dtype == torch.uint8:
             image = image.float() / 255
-        leading = image.shape[:-3]
-        return self.dense(self.convolutions(image.reshape(-1, *image.shape[-3:]))).unflatten(0, leading)
+        features = self.dense(self.convolutions(image.reshape(-1, *image.shape[-3:])))
+        return features.view(*image.shape[:-3], self.out_features)
 
 
 class CellFeatures(nn.Module):

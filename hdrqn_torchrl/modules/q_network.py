@@ -32,6 +32,8 @@ class QNetwork(nn.Module):
         hidden_size: H, size of the recurrent layer (or of the dense layer in its place).
         num_conditions: number of values of an integer condition (the subgoal), appended to the features as
             a one-hot vector; 0 for none.
+        gate_features: let the condition scale each feature, too, by learned factors. Appended alone it is a faint
+            signal: "go to goal k" needs the product of what is seen and which goal is wanted.
         recurrent: ``False`` replaces the LSTM by a dense layer with ReLU; states then pass through unchanged.
 
     Examples:
@@ -50,6 +52,7 @@ class QNetwork(nn.Module):
         num_actions: int,
         hidden_size: int,
         num_conditions: int = 0,
+        gate_features: bool = False,
         recurrent: bool = True,
     ) -> None:
         super().__init__()
@@ -63,6 +66,10 @@ class QNetwork(nn.Module):
         else:
             self.memory = nn.Sequential(nn.Linear(size, hidden_size), nn.ReLU())
         self.register_buffer("_one_hot", torch.eye(num_conditions), persistent=False)
+        self.gate = None
+        if gate_features and num_conditions:
+            self.gate = nn.Embedding(num_conditions, features.out_features)
+            nn.init.normal_(self.gate.weight, 1.0, 0.5)
         self.head = DuelingHead(hidden_size, num_actions)
 
     def initial_state(self, *batch: int) -> State:
@@ -72,7 +79,11 @@ class QNetwork(nn.Module):
 
     def _embed(self, observation: Tensor, condition: Tensor | None) -> Tensor:
         features = self.features(observation)
-        return features if condition is None else torch.cat([features, self._one_hot[condition]], -1)
+        if condition is None:
+            return features
+        if self.gate is not None:
+            features = features * self.gate(condition)
+        return torch.cat([features, self._one_hot[condition]], -1)
 
     def _cell(self, features: Tensor, state: State) -> State:
         memory = self.memory

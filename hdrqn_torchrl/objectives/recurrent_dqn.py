@@ -136,22 +136,22 @@ class RecurrentDQNLoss(LossModule):
         return [k.action, k.init, *self._input_keys, *masks, *(unravel_key(("next", key)) for key in nexts + masks)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        k, after = self.tensor_keys, tensordict.get("next")
+        k, after = self.tensor_keys, tensordict["next"]
         valid = _steps_of(tensordict.get(k.mask, None), tensordict)
         if valid is None:
             valid = torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device)
-        init = _steps_of(tensordict.get(k.init), tensordict) & valid
-        done, terminated = _steps_of(after.get(k.done), tensordict), _steps_of(after.get(k.terminated), tensordict)
+        init = _steps_of(tensordict[k.init], tensordict) & valid
+        done, terminated = _steps_of(after[k.done], tensordict), _steps_of(after[k.terminated], tensordict)
 
         inputs = self._inputs(tensordict, valid, init)
         online, target = self._action_values(inputs)
-        chosen = online[:, :-1].gather(-1, tensordict.get(k.action).unsqueeze(-1)).squeeze(-1)
+        chosen = online[:, :-1].gather(-1, tensordict[k.action].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
             mask = None if k.action_mask is None else inputs.get(k.action_mask)[:, 1:]
             chooser = online.detach() if self.double else target
             next_value = double_q_value(chooser[:, 1:], target[:, 1:], mask)
-            steps = None if k.steps is None else _steps_of(after.get(k.steps), tensordict)
-            reward = _steps_of(after.get(k.reward), tensordict)
+            steps = None if k.steps is None else _steps_of(after[k.steps], tensordict)
+            reward = _steps_of(after[k.reward], tensordict)
             wanted = smdp_target(reward, terminated, next_value, self.gamma, steps)
             trained = training_mask(valid, init, self.burn_in, self.train_exact_states)
             trained = trained & ~_ends_unseen(done & ~terminated, valid)
@@ -168,22 +168,20 @@ class RecurrentDQNLoss(LossModule):
         return TensorDict({"loss": loss, **report}, [])
 
     def _inputs(self, tensordict: TensorDictBase, valid: Tensor, init: Tensor) -> TensorDictBase:
-        """The T + 1 inputs of each sequence: what was seen at each step, then what followed the last one.
-
-        A padded step repeats the last valid one, so what follows the last valid step stands in its ``next``.
-        """
+        """The T + 1 inputs of each sequence: what was seen at each step, then what followed the last valid one."""
         k = self.tensor_keys
         mask_keys = [] if k.action_mask is None else [k.action_mask]
         padded = not bool(valid.all())
-        seen = torch.cat([valid[:, :1], valid], 1) if padded else None  # inputs that some valid step uses
+        nothing = torch.zeros_like(valid[:, :1])
+        own, reached = torch.cat([valid, nothing], 1), torch.cat([nothing, valid], 1)  # seen at, or after, a valid step
         inputs = TensorDict({}, (tensordict.shape[0], tensordict.shape[1] + 1), device=tensordict.device)
         for key in (*self._input_keys, *mask_keys):
-            now, following = tensordict.get(key), tensordict.get(unravel_key(("next", key)))
-            if padded:
-                now = torch.where(_expand(valid, now), now, following)
+            now, following = tensordict[key], tensordict[unravel_key(("next", key))]
             stream = torch.cat([now, following[:, -1:]], 1)
-            if seen is not None and stream.is_floating_point():
-                stream = stream.masked_fill(~_expand(seen, stream), 0.0)
+            if padded:
+                stream = torch.where(_expand(own, stream), stream, torch.cat([now[:, :1], following], 1))
+                if stream.is_floating_point():
+                    stream = stream.masked_fill(~_expand(own | reached, stream), 0.0)
             inputs.set(key, stream)
         restart = torch.cat([init, torch.zeros_like(init[:, :1])], 1)
         return inputs.set(k.init, restart.unsqueeze(-1))

@@ -59,7 +59,7 @@ def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_state
     Args:
         valid: steps that are not padding; padding only follows valid steps.
         init: steps before which the recurrent state restarts from zero in acting.
-        burn_in: share of each sequence's valid steps, rounded down, that is left out at its beginning.
+        burn_in: share of each sequence, rounded down to steps, that is left out at its beginning.
         train_exact_states: whether leading steps whose state is exact are trained nevertheless. Without it a short
             trajectory's first steps are never trained.
 
@@ -71,8 +71,8 @@ def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_state
         >>> training_mask(valid, init, burn_in=0.75, train_exact_states=True)
         tensor([[False,  True,  True,  True]])
     """
-    skipped = (valid.sum(-1, keepdim=True) * burn_in).long()
-    mask = torch.arange(valid.shape[-1], device=valid.device) >= skipped
+    length = valid.shape[-1]
+    mask = (torch.arange(length, device=valid.device) >= int(length * burn_in)).expand_as(valid)
     if train_exact_states:
         mask = mask | (init.cumsum(-1) > 0)
     return mask & valid

@@ -1,3 +1,5 @@
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch import nn
@@ -52,11 +54,9 @@ def test_gradients_equal_finite_differences():
     lstm, inputs, init, state = make_case(2, 4, 0.3)
     init[0, 2] = True
 
-    def run(inputs, hidden, cell, *parameters):
-        for name, value in zip(("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0"), parameters, strict=True):
-            lstm.__dict__.setdefault("_shadow", {})[name] = value
-        shadow = type("Weights", (), lstm.__dict__["_shadow"])
-        return restarting_lstm(shadow, inputs, init, (hidden, cell))
+    def run(inputs, hidden, cell, *weights):
+        names = (name for name, _ in lstm.named_parameters())
+        return restarting_lstm(SimpleNamespace(**dict(zip(names, weights, strict=True))), inputs, init, (hidden, cell))
 
     assert torch.autograd.gradcheck(run, (inputs, *state, *lstm.parameters()))
 

@@ -3,7 +3,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import AGENT, CORRIDOR, LEFT, OBJECTS, RIGHT, small_env, subgoal_env
-from torchrl.envs import Compose, InitTracker, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.transforms import RenameTransform
 from torchrl.envs.utils import check_env_specs, step_mdp
 

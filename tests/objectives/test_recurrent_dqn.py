@@ -1,0 +1,491 @@
+from copy import deepcopy
+
+import pytest
+import torch
+from helpers import parameter_distance, unroll_by_steps
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import nn
+from torch.nn import functional
+from torchrl.modules import LSTMModule, set_recurrent_mode
+from torchrl.objectives import SoftUpdate
+
+from hdrqn_torchrl.modules import FullyConnectedFeatures, MetaController, QNetwork, SubController
+from hdrqn_torchrl.objectives import RecurrentDQNLoss
+
+NAN = float("nan")
+BATCH, TIME, SIZE, ACTIONS = 6, 5, 3, 4
+SUB_KEYS = {
+    "reward": "intrinsic_reward",
+    "done": "option_done",
+    "terminated": "option_terminated",
+    "init": "option_init",
+}
+META_KEYS = {"action": "subgoal", "reward": "option_return", "steps": "option_steps", "action_mask": "subgoal_mask"}
+
+
+def make_controller(level="flat", *, recurrent=True):
+    conditions = 2 if level == "sub" else 0
+    features = FullyConnectedFeatures(SIZE, (7,))
+    settings = {"num_actions": ACTIONS, "hidden_size": 6, "num_conditions": conditions, "recurrent": recurrent}
+    network = QNetwork(features, **settings).double()
+    if level == "meta":
+        return MetaController(network)
+    if level == "sub":
+        return SubController(network)
+    return SubController(network, subgoal_key=None, init_key="is_init")
+
+
+def make_loss(level="flat", *, recurrent=True, **settings):
+    """A loss whose target network differs from the main one."""
+    torch.manual_seed(0)
+    controller = make_controller(level, recurrent=recurrent)
+    loss = RecurrentDQNLoss(controller, **({"gamma": 0.9} | settings))
+    loss.set_keys(**{"flat": {}, "sub": SUB_KEYS, "meta": META_KEYS}[level])
+    with torch.no_grad():
+        for parameter in target_parameters(loss, controller.network):
+            parameter.add_(0.3 * torch.randn_like(parameter))
+    return loss, controller.network
+
+
+def target_parameters(loss, network):
+    """Parameters of the target network, in the order of those of the main network."""
+    names = [name for name, _ in network.named_parameters()]
+    return [loss.target_value_network_params[("network", *name.split("."))] for name in names]
+
+
+def target_of(loss, network):
+    """The target network as a network of its own."""
+    copy = deepcopy(network)
+    with torch.no_grad():
+        for parameter, value in zip(copy.parameters(), target_parameters(loss, network), strict=True):
+            parameter.copy_(value)
+    return copy
+
+
+def make_sample(seed=0, *, padded=True):
+    """Sequences ``[B, T]`` as the replay memory gives them, for all three levels at once.
+
+    Row 0 is a whole sequence, row 1 starts an episode, row 2 has two options, the first cut by its time limit,
+    row 3 has one that terminates; rows 4 and 5 are shorter if ``padded`` (their last step is repeated).
+    """
+    generator = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(BATCH, TIME, *shape, generator=generator, dtype=torch.double)  # noqa: E731
+    flag = lambda: torch.zeros(BATCH, TIME, 1, dtype=torch.bool)  # noqa: E731
+    stream = torch.randn(BATCH, TIME + 1, SIZE, generator=generator, dtype=torch.double)
+    sample = TensorDict({}, [BATCH, TIME])
+    sample["observation"] = stream[:, :-1]
+    sample["action"] = torch.randint(ACTIONS, (BATCH, TIME), generator=generator)
+    sample["subgoal"] = torch.randint(2, (BATCH, 1), generator=generator).repeat(1, TIME)
+    sample["is_init"], sample["option_init"] = flag(), flag()
+    sample["is_init"][1, 0] = sample["option_init"][1, 0] = True
+    sample["option_init"][2, 2] = sample["option_init"][3, 3] = True
+    after = TensorDict({}, [BATCH, TIME])
+    after["observation"], after["subgoal"] = stream[:, 1:], sample["subgoal"]
+    for key in ("reward", "intrinsic_reward", "option_return"):
+        after[key] = draw(1)
+    for key in ("done", "terminated", "option_done", "option_terminated"):
+        after[key] = flag()
+    after["done"][1, -1] = after["option_done"][2, 1] = after["option_done"][1, -1] = True
+    for key in ("option_done", "option_terminated"):
+        after[key][3, 2] = True
+    after["done"][4, -1] = after["terminated"][4, -1] = True
+    after["option_steps"] = torch.randint(1, 6, (BATCH, TIME, 1), generator=generator)
+    mask = torch.rand(BATCH, TIME + 1, ACTIONS, generator=generator) < 0.6
+    sample["subgoal_mask"], after["subgoal_mask"] = mask[:, :-1], mask[:, 1:]
+    sample["next"] = after
+    if padded:
+        lengths = torch.tensor([5, 5, 5, 5, 3, 1])
+        time = torch.arange(TIME).expand(BATCH, TIME).minimum(lengths[:, None] - 1)
+        sample = sample[torch.arange(BATCH)[:, None], time].contiguous()
+        sample["collector", "mask"] = torch.arange(TIME) < lengths[:, None]
+        sample["next", "done"][4, 2] = sample["next", "terminated"][4, 2] = True
+    return sample
+
+
+def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, double=True, huber=False):
+    """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps."""
+    keys = {"action": "action", "reward": "reward", "done": "done", "terminated": "terminated", "init": "is_init"}
+    keys |= {"flat": {}, "sub": SUB_KEYS, "meta": META_KEYS}[level]
+    target_network, gamma = target_of(loss, network), loss.gamma.item()
+    after, total, count = sample["next"], 0.0, 0
+    for b in range(len(sample)):
+        length = int(sample["collector", "mask"][b].sum()) if ("collector", "mask") in sample else TIME
+        stream = torch.cat([sample["observation"][b, :length], after["observation"][b, length - 1 : length]])[None]
+        subgoal = sample["subgoal"][b : b + 1, :1].repeat(1, length + 1) if level == "sub" else None
+        init = torch.cat([sample[keys["init"]][b, :length, 0], torch.tensor([False])])[None]
+        q = unroll_by_steps(network, stream, subgoal, init)[0]
+        with torch.no_grad():
+            target_q = unroll_by_steps(target_network, stream, subgoal, init)[0]
+        for t in range(length):
+            is_exact = exact and bool(init[0, : t + 1].any())
+            done, terminated = after[keys["done"]][b, t].item(), after[keys["terminated"]][b, t].item()
+            if (t < int(TIME * burn_in) and not is_exact) or (done and not terminated and t < length - 1):
+                continue
+            allowed = [True] * ACTIONS
+            if "action_mask" in keys and after["subgoal_mask"][b, t].any():
+                allowed = after["subgoal_mask"][b, t].tolist()
+            chooser = (q if double else target_q)[t + 1].tolist()
+            best = max((a for a in range(ACTIONS) if allowed[a]), key=lambda a: chooser[a])
+            steps = after["option_steps"][b, t].item() if "steps" in keys else 1
+            y = after[keys["reward"]][b, t, 0] + (0.0 if terminated else gamma**steps * target_q[t + 1, best])
+            prediction = q[t, sample[keys["action"]][b, t]]
+            total = total + (functional.smooth_l1_loss(prediction, y) if huber else (prediction - y) ** 2)
+            count += 1
+    return total / count, count
+
+
+class TestAgainstPlainLoops:
+    @pytest.mark.parametrize("padded", [True, False])
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    @pytest.mark.parametrize(
+        "settings",
+        [
+            {},
+            {"train_exact_states": False},
+            {"burn_in": 0.0},
+            {"burn_in": 0.8},
+            {"double": False},
+            {"loss_function": "smooth_l1"},
+            {"gamma": 1.0},
+            {"recurrent": False},
+        ],
+        ids=str,
+    )
+    def test_loss_and_gradients(self, level, padded, settings):
+        loss, network = make_loss(level, **settings)
+        sample = make_sample(padded=padded)
+        result = loss(sample.clone())
+        wanted, count = reference(
+            loss,
+            network,
+            sample,
+            level=level,
+            burn_in=settings.get("burn_in", 0.5),
+            exact=settings.get("train_exact_states", True),
+            double=settings.get("double", True),
+            huber="loss_function" in settings,
+        )
+        assert result["trained_steps"].item() == count
+        torch.testing.assert_close(result["loss"], wanted)
+        parameters = list(network.parameters())
+        gradients = torch.autograd.grad(result["loss"], parameters, allow_unused=True)
+        for gradient, want in zip(gradients, torch.autograd.grad(wanted, parameters), strict=True):
+            torch.testing.assert_close(gradient, want)
+
+    def test_without_target_network_the_main_one_values_the_next_step(self):
+        torch.manual_seed(0)
+        controller, sample = make_controller(), make_sample()
+        loss = RecurrentDQNLoss(controller, gamma=0.9, delay_value=False)
+        fresh = RecurrentDQNLoss(deepcopy(controller), gamma=0.9)  # its target network is an equal copy
+        wanted, _ = reference(fresh, controller.network, sample)
+        torch.testing.assert_close(loss(sample)["loss"], wanted)
+        step_once(loss, sample)
+        assert loss(sample)["target"] != fresh(sample)["target"]
+
+    def test_reported_means(self):
+        loss, network = make_loss()
+        sample = make_sample(padded=False)
+        result = loss(sample)
+        network_q = unroll_by_steps(
+            network, torch.cat([sample["observation"], sample["next", "observation"][:, -1:]], 1)
+        )
+        trained = torch.ones(BATCH, TIME, dtype=torch.bool)
+        trained[[0, 2, 3, 4, 5], :2] = False
+        chosen = network_q[:, :-1].gather(-1, sample["action"][..., None])[..., 0]
+        assert result["q_value"].item() == pytest.approx(chosen[trained].mean().item())
+        assert result["loss"].item() >= result["td_error"].item() ** 2
+        assert (result["target"] - result["q_value"]).abs().item() <= result["td_error"].item() + 1e-12
+        assert not any(result[key].requires_grad for key in loss.out_keys if key != "loss")
+
+
+class TestLeaks:
+    """Nothing in one sequence changes what is learned from another."""
+
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    def test_the_loss_of_a_batch_is_that_of_its_rows(self, level):
+        loss, _ = make_loss(level)
+        sample = make_sample()
+        rows = [loss(sample[b : b + 1]) for b in range(BATCH)]
+        together = loss(sample)
+        summed = sum(row["loss"] * row["trained_steps"] for row in rows) / sum(row["trained_steps"] for row in rows)
+        torch.testing.assert_close(together["loss"], summed)
+
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    def test_a_changed_row_changes_no_other_rows_values(self, level):
+        _, network = make_loss(level)
+        controller = {"flat": flat, "sub": SubController, "meta": MetaController}[level](network)
+        sample = make_sample()
+        changed = sample.clone()
+        changed["observation"][0] += 1.0
+        with set_recurrent_mode(True):
+            before, after = controller(sample.clone())["action_value"], controller(changed)["action_value"]
+        assert (before[0] != after[0]).all()
+        assert (before[1:] == after[1:]).all()
+
+    def test_an_option_learns_nothing_from_the_one_before_it(self):
+        loss, _ = make_loss("sub", train_exact_states=True, burn_in=0.8)
+        sample = make_sample(padded=False)[2:3]  # options: steps 0 and 1, then 2 to 4
+        changed = sample.clone()
+        changed["observation"][:, :2] += 1.0
+        assert loss(sample)["trained_steps"] == 3
+        assert loss(sample)["loss"] == loss(changed)["loss"]
+        changed["observation"][:, 2] += 1.0
+        assert loss(sample)["loss"] != loss(changed)["loss"]
+
+    def test_an_option_that_ends_in_mid_sequence_has_the_exact_target(self):
+        """A terminated option needs nothing from the next one, a cut one is left out."""
+        loss, _ = make_loss("sub", burn_in=0.0)
+        sample = make_sample(padded=False)
+        cut, terminated = sample[2:3], sample[3:4]
+        assert loss(cut)["trained_steps"] == TIME - 1
+        assert loss(terminated)["trained_steps"] == TIME
+        first_option = terminated[:, :3].clone()
+        changed = first_option.clone()
+        changed["next", "observation"][:, -1] += 1.0
+        torch.testing.assert_close(loss(first_option)["loss"], loss(changed)["loss"])
+
+
+def flat(network):
+    return SubController(network, subgoal_key=None, init_key="is_init")
+
+
+class TestShortSequences:
+    @pytest.mark.parametrize("length", [1, 2, 3])
+    @pytest.mark.parametrize("level", ["sub", "meta"])
+    def test_options_and_episodes_far_shorter_than_the_slice_are_trained(self, level, length):
+        loss, _ = make_loss(level)
+        short = make_sample(padded=False)[1:2, :length]
+        padded = short[:, torch.arange(8).clamp(max=length - 1)].contiguous()
+        padded["collector", "mask"] = (torch.arange(8) < length)[None]
+        result = loss(padded)
+        assert result["trained_steps"] == length and result["loss"] > 0
+        torch.testing.assert_close(result["loss"], loss(short)["loss"])
+
+    def test_a_batch_in_which_nothing_is_trained_costs_nothing(self):
+        loss, network = make_loss(burn_in=0.5, train_exact_states=False)
+        sample = make_sample()
+        sample["collector", "mask"] = torch.zeros(BATCH, TIME, dtype=torch.bool)
+        result = loss(sample)
+        assert result["loss"].item() == 0 and result["trained_steps"] == 0
+        result["loss"].backward()
+        assert all(p.grad is None or not p.grad.any() for p in network.parameters())
+
+
+class TestNaN:
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    def test_nan_in_the_padding_reaches_neither_loss_nor_gradient(self, level):
+        loss, network = make_loss(level)
+        sample = make_sample()
+        clean = loss(sample)["loss"]
+        wanted = torch.autograd.grad(clean, list(network.parameters()))
+        padding = ~sample["collector", "mask"]
+        assert padding.any()
+        for part in (sample, sample["next"]):
+            for value in part.values():
+                if isinstance(value, torch.Tensor) and value.is_floating_point():
+                    value[padding] = NAN
+        dirty = loss(sample)["loss"]
+        torch.testing.assert_close(dirty, clean)
+        for gradient, want in zip(torch.autograd.grad(dirty, list(network.parameters())), wanted, strict=True):
+            torch.testing.assert_close(gradient, want)
+
+    def test_padding_need_not_repeat_the_last_step(self):
+        loss, _ = make_loss()
+        sample = make_sample()
+        clean, padding = loss(sample)["loss"], ~sample["collector", "mask"]
+        for value in (sample["observation"], sample["next", "observation"], sample["next", "reward"]):
+            value[padding] = 5.0
+        sample["is_init"][padding] = sample["next", "done"][padding] = True
+        torch.testing.assert_close(loss(sample)["loss"], clean)
+
+
+class TestTargetNetwork:
+    def test_it_starts_as_a_copy(self):
+        loss = RecurrentDQNLoss(make_controller())
+        assert parameter_distance(loss.value_network_params, loss.target_value_network_params) == 0
+
+    def test_no_gradient_reaches_it_and_no_optimiser_step_moves_it(self):
+        loss, network = make_loss()
+        before = loss.target_value_network_params.clone()
+        optimiser = torch.optim.SGD(loss.parameters(), lr=0.1)
+        values = [p.detach().clone() for p in network.parameters()]
+        loss(make_sample())["loss"].backward()
+        optimiser.step()
+        assert all(p.grad is None for p in loss.target_value_network_params.values(True, True))
+        assert not any(p.requires_grad for p in loss.target_value_network_params.values(True, True))
+        assert parameter_distance(before, loss.target_value_network_params) == 0
+        assert all((p != old).any() for p, old in zip(network.parameters(), values, strict=True))
+
+    def test_the_targets_come_from_it(self):
+        loss, network = make_loss()
+        sample = make_sample()
+        before = loss(sample)
+        with torch.no_grad():
+            for parameter in target_parameters(loss, network):
+                parameter.mul_(2.0)
+        after = loss(sample)
+        assert before["target"] != after["target"] and before["q_value"] == after["q_value"]
+
+    def test_a_soft_update_moves_it_at_the_rate_tau(self):
+        torch.manual_seed(0)
+        controller = make_controller()
+        loss = RecurrentDQNLoss(controller)
+        updater, network = SoftUpdate(loss, tau=0.1), controller.network
+        with torch.no_grad():
+            for parameter in network.parameters():
+                parameter.add_(1.0)
+        for updates in (1, 2, 3):
+            updater.step()
+            for main, target in zip(network.parameters(), target_parameters(loss, network), strict=True):
+                torch.testing.assert_close(main - target, torch.full_like(main, 0.9**updates))
+        sample = make_sample()
+        torch.testing.assert_close(loss(sample)["loss"], reference(loss, network, sample)[0])
+
+    def test_it_is_not_among_the_parameters_to_train(self):
+        loss, network = make_loss()
+        trained = {id(p) for p in loss.parameters() if p.requires_grad}
+        assert trained == {id(p) for p in network.parameters()}
+
+
+def step_once(loss, sample):
+    optimiser = torch.optim.SGD([p for p in loss.parameters() if p.requires_grad], lr=0.1)
+    loss(sample)["loss"].backward()
+    optimiser.step()
+
+
+class TestOneNetworkForActingAndLearning:
+    """The acting network and the loss share their parameters, whatever is done to the loss."""
+
+    def check(self, loss, network):
+        """An update through the loss changes what the acting network computes, and the loss reads what it has."""
+        sample = make_sample()
+        before = network.unroll(sample["observation"])
+        step_once(loss, sample)
+        assert (network.unroll(sample["observation"]) != before).any()
+        torch.testing.assert_close(loss(sample)["loss"], reference(loss, network, sample)[0])
+
+    def test_as_built(self):
+        self.check(*make_loss())
+
+    def test_after_to(self):
+        loss, network = make_loss()
+        self.check(loss.to("cpu"), network)
+
+    def test_after_a_change_of_dtype_and_back(self):
+        loss, network = make_loss()
+        self.check(loss.to(torch.float32).to(torch.float64), network)
+
+    def test_after_a_round_trip_through_the_state_dict(self):
+        source, source_network = make_loss()
+        sample = make_sample()
+        step_once(source, sample)
+        loss, network = make_loss()
+        loss.load_state_dict(deepcopy(source.state_dict()))
+        assert parameter_distance(source.value_network_params, loss.value_network_params) == 0
+        assert parameter_distance(source.target_value_network_params, loss.target_value_network_params) == 0
+        torch.testing.assert_close(loss(sample)["loss"], source(sample)["loss"])
+        torch.testing.assert_close(network.unroll(sample["observation"]), source_network.unroll(sample["observation"]))
+        self.check(loss, network)
+
+    def test_after_the_acting_network_loads_weights(self):
+        loss, network = make_loss()
+        other = make_controller().network
+        network.load_state_dict(other.state_dict())
+        self.check(loss, network)
+
+
+class TestStockModules:
+    """Any TorchRL module with the right keys can be the value network."""
+
+    def make(self):
+        torch.manual_seed(0)
+        lstm = LSTMModule(input_size=SIZE, hidden_size=6, in_key="observation", out_key="features").double()
+        head = nn.Sequential(nn.Linear(6, 8), nn.ReLU(), nn.Linear(8, ACTIONS)).double()
+        network = TensorDictSequential(lstm, TensorDictModule(head, in_keys=["features"], out_keys=["action_value"]))
+        return network, lambda x: head(lstm.lstm(x)[0])
+
+    def test_an_lstm_and_a_multilayer_perceptron(self):
+        network, values = self.make()
+        loss = RecurrentDQNLoss(network, gamma=0.9, train_exact_states=False)
+        sample = make_sample(padded=False)
+        q = values(torch.cat([sample["observation"], sample["next", "observation"][:, -1:]], 1))
+        chosen = q[:, :-1].gather(-1, sample["action"][..., None])[..., 0]
+        value = q[:, 1:].max(-1).values.detach() * ~sample["next", "terminated"][..., 0]
+        error = (sample["next", "reward"][..., 0] + 0.9 * value - chosen) ** 2
+        torch.testing.assert_close(loss(sample)["loss"], error[:, 2:].mean())
+
+    def test_its_state_restarts_where_an_episode_starts(self):
+        network, _ = self.make()
+        loss = RecurrentDQNLoss(network, gamma=0.9, burn_in=0.8)
+        sample = make_sample(padded=False)[:1]
+        sample["is_init"][0, 2] = True
+        changed = sample.clone()
+        changed["observation"][:, :2] += 1.0
+        assert loss(sample)["trained_steps"] == 3
+        torch.testing.assert_close(loss(sample)["loss"], loss(changed)["loss"])
+
+    def test_recurrent_states_are_not_read_from_the_sample(self):
+        network, _ = self.make()
+        loss = RecurrentDQNLoss(network)
+        states = [key for key in network.in_keys if "recurrent" in str(key) or "hidden" in str(key)]
+        assert states and not set(states) & set(loss.in_keys)
+
+    def test_a_feed_forward_network(self):
+        network = TensorDictModule(nn.Linear(SIZE, ACTIONS).double(), ["observation"], ["action_value"])
+        result = RecurrentDQNLoss(network)(make_sample())
+        assert result["loss"] > 0
+
+
+class TestKeys:
+    def test_every_key_can_be_renamed_and_nested(self):
+        loss, network = make_loss("meta")
+        names = {
+            "action": "subgoal", "reward": "option_return", "steps": "option_steps", "done": "done",
+            "terminated": "terminated", "init": "is_init", "action_mask": "subgoal_mask",
+        }  # fmt: skip
+        sample = make_sample()
+        wanted = loss(sample)["loss"]
+        renamed = sample.clone()
+        for name in names.values():
+            for part in (renamed, renamed["next"]):
+                if name in part:
+                    part["other", name] = part.pop(name)
+        renamed["my_mask"] = renamed.pop(("collector", "mask"))
+        controller = MetaController(network, mask_key=("other", "subgoal_mask"), action_value_key=("other", "q"))
+        other = RecurrentDQNLoss(controller, gamma=0.9)
+        other.target_value_network_params.data.copy_(loss.target_value_network_params.data)
+        other.set_keys(
+            **{kind: ("other", name) for kind, name in names.items()}, mask="my_mask", action_value=("other", "q")
+        )
+        torch.testing.assert_close(other(renamed)["loss"], wanted)
+
+    def test_in_keys_are_what_it_reads_and_all_it_reads(self):
+        for level in ("flat", "sub", "meta"):
+            loss, _ = make_loss(level)
+            sample = make_sample()
+            wanted = loss(sample)["loss"]
+            kept = sample.select(*loss.in_keys, ("collector", "mask"))
+            assert loss(kept)["loss"] == wanted
+            for key in loss.in_keys:
+                with pytest.raises(KeyError, match=str(key[-1] if isinstance(key, tuple) else key)):
+                    loss(kept.exclude(key))
+
+    def test_the_sample_is_left_as_it_was(self):
+        loss, _ = make_loss()
+        sample = make_sample()
+        before = sample.clone()
+        loss(sample)
+        assert (sample == before).all() and set(sample.keys(True)) == set(before.keys(True))
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"gamma": 1.1}, r"gamma must lie in \[0, 1\], got 1.1; "),
+            ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
+            ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
+        ],
+    )
+    def test_wrong_values(self, settings, message):
+        with pytest.raises(ValueError, match=message):
+            RecurrentDQNLoss(make_controller(), **settings)
