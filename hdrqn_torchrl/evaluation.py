@@ -75,13 +75,14 @@ def evaluate(
 
     Returns:
         ``return_mean``, ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete
-        the whole task), ``in_order_rate`` (share of subgoals reached in the proper order), ``steps_mean``, ``episodes``.
+        the whole task), ``in_order_rate`` (share of subgoals reached in the proper
+        order), ``steps_mean``, ``episodes``.
     """
     env.set_seed(seed)
     with set_exploration_type(exploration_type), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         rounds = [_play_once(env, policy) for _ in range(-(-episodes // env.batch_size[0]))]
-    played = torch.cat(rounds, 0)
+    played: TensorDictBase = torch.cat(rounds, 0)  # type: ignore[assignment]
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
     return {
         "return_mean": _mean(played["return"]),

@@ -13,7 +13,7 @@ References = dict[str, dict[str, float]]
 
 def write_results(
     folder: Path, trainer: Trainer, result: dict[str, float], *, references: References, title: str = ""
-) -> dict[str, float]:
+) -> dict[str, float | None]:
     """Writes ``summary.json`` and ``curves.png``.
 
     Args:
@@ -26,7 +26,7 @@ def write_results(
     Returns:
         What stands in ``summary.json``.
     """
-    summary = {
+    summary: dict[str, float | None] = {
         **result,
         "frames": trainer.frames,
         "updates": trainer.updates,

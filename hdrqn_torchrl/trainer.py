@@ -156,7 +156,7 @@ class _Window:
         seconds = max(time.monotonic() - self._since, 1e-9)
         row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
         if self._episodes:
-            episodes = torch.cat(self._episodes, 0)
+            episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
             row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items()}
         for learner, sums in self._sums.items():
             count = self._counts[learner]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -78,7 +79,7 @@ class OptionExtractor:
         starts = batch.select(*self._start_keys)
         started = batch.get(self.option_init_key).squeeze(-1)
         ended = batch.get(unravel_key(("next", self.option_done_key))).squeeze(-1)
-        if self._is_open is None:
+        if self._is_open is None or self._open_starts is None:
             self._open_starts, self._is_open = starts[:, 0].clone(), torch.zeros_like(started[:, 0])
         starts = torch.cat([self._open_starts.unsqueeze(1), starts], 1)  # [N, 1 + T]: in progress, then new
         # A batch that begins with a start where an option was open follows a reset: that option is lost.
@@ -92,7 +93,7 @@ class OptionExtractor:
         environments = torch.arange(len(started), device=started.device)
         self._open_starts = starts[environments, last_start]
         started[environments, last_start] &= ~self._is_open
-        return self._release(self._pair(batch, starts, started, ended))
+        return self._release(self._pair(batch, starts, started, ended), num_envs=len(batch))
 
     def _pair(self, batch: TensorDictBase, starts: TensorDictBase, started: Tensor, ended: Tensor) -> TensorDictBase:
         environment, end_time = ended.nonzero(as_tuple=True)
@@ -104,23 +105,23 @@ class OptionExtractor:
         options.set("next", after.select(*self._end_keys))
         return options.set("environment", environment)
 
-    def _release(self, options: TensorDictBase) -> TensorDictBase | None:
+    def _release(self, options: TensorDictBase, num_envs: int) -> TensorDictBase | None:
         if self._held is not None:
             options = torch.cat([self._held, options], 0)
             options = options[options.get("environment").argsort(stable=True)]
         environment, rows = options.get("environment"), torch.arange(len(options), device=options.device)
         ends = torch.where(options.get(("next", keys.DONE)).squeeze(-1), rows, -1)
-        last_end = torch.full_like(self._is_open, -1, dtype=rows.dtype).scatter_reduce(0, environment, ends, "amax")
+        last_end = rows.new_full((num_envs,), -1).scatter_reduce(0, environment, ends, "amax")
         complete = rows <= last_end[environment]
         self._held = options[~complete]
         released = options[complete].exclude("environment")
         return released if len(released) else None
 
-    def state_dict(self) -> dict[str, TensorDictBase | Tensor | None]:
+    def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""
         return {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
 
-    def load_state_dict(self, state: dict[str, TensorDictBase | Tensor | None]) -> None:
+    def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._open_starts, self._is_open, self._held = state["open_starts"], state["is_open"], state["held"]
 

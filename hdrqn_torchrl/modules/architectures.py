@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from torch import nn
 from torchrl.data import Categorical, TensorSpec
 
-from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
+from hdrqn_torchrl.modules.features import (
+    CellFeatures,
+    CellsToImage,
+    ChainedFeatures,
+    ConvFeatures,
+    Features,
+    FullyConnectedFeatures,
+)
 from hdrqn_torchrl.modules.q_network import QNetwork
 
 
@@ -25,16 +31,15 @@ class Architecture:
 
     hidden_size: int
     gate_features: bool = False
-    observation_features: Callable[[TensorSpec], nn.Module]
-    vector_features: Callable[[int], nn.Module]
+    observation_features: Callable[[TensorSpec], Features]
+    vector_features: Callable[[int], Features]
 
     def q_network(
         self, inputs: TensorSpec | int, *, num_actions: int, num_conditions: int = 0, recurrent: bool = True
     ) -> QNetwork:
-        """A Q-network for an observation spec (without batch dimensions' meaning) or a vector of given size."""
-        make = self.vector_features if isinstance(inputs, int) else self.observation_features
+        """A Q-network for an observation spec or a vector of given size."""
         return QNetwork(
-            make(inputs),
+            self.vector_features(inputs) if isinstance(inputs, int) else self.observation_features(inputs),
             num_actions=num_actions,
             hidden_size=self.hidden_size,
             num_conditions=num_conditions,
@@ -53,10 +58,10 @@ def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Arc
         gate_features: whether the subgoal scales the features beside being appended to them.
     """
 
-    def observation_features(spec: TensorSpec) -> nn.Module:
+    def observation_features(spec: TensorSpec) -> Features:
         if not is_grid(spec):
             return ConvFeatures(spec.shape[-3], spec.shape[-1])
-        return nn_chain(CellsToImage(spec.shape[-1], spec.n), ConvFeatures())
+        return ChainedFeatures(CellsToImage(spec.shape[-1], spec.n), ConvFeatures())
 
     return Architecture(
         hidden_size=hidden_size,
@@ -77,7 +82,7 @@ def compact_network(
         gate_features: whether the subgoal scales the features beside being appended to them.
     """
 
-    def observation_features(spec: TensorSpec) -> nn.Module:
+    def observation_features(spec: TensorSpec) -> Features:
         if is_grid(spec):
             return CellFeatures(spec.shape[-1], spec.n, tuple(widths))
         return ConvFeatures(spec.shape[-3], spec.shape[-1], widths[-1], channels=(16, 32, 32, 32))
@@ -93,10 +98,3 @@ def compact_network(
 def is_grid(spec: TensorSpec) -> bool:
     """Whether an observation spec is a window of cell codes (otherwise it is an image)."""
     return isinstance(spec, Categorical)
-
-
-def nn_chain(first: nn.Module, last: nn.Module) -> nn.Module:
-    """``nn.Sequential`` that tells its number of features."""
-    chain = nn.Sequential(first, last)
-    chain.out_features = last.out_features
-    return chain

@@ -89,8 +89,7 @@ class SubController(TensorDictModuleBase):
         if recurrent_mode():
             return tensordict.set(self.action_value_key, self.network.unroll(observation, subgoal, init.squeeze(-1)))
         if not self.network.recurrent:
-            value, _ = self.network.step(observation, subgoal, ())
-            return tensordict.set(self.action_key, self.exploration(value))
+            return tensordict.set(self.action_key, self.exploration(self.network.evaluate(observation, subgoal)))
         hidden = tensordict.get(self.hidden_key).masked_fill(init, 0.0)
         cell = tensordict.get(self.cell_key).masked_fill(init, 0.0)
         value, (hidden, cell) = self.network.step(observation, subgoal, (hidden, cell))
@@ -182,17 +181,16 @@ class MetaController(TensorDictModuleBase):
         if recurrent_mode():
             return tensordict.set(self.action_value_key, self.network.unroll(inputs))
         gate = tensordict.get(self.gate_key)
+        if self.network.recurrent:
+            state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
+            value, advanced = self.network.step(inputs, None, state)
+            for key, new, old in zip((self.hidden_key, self.cell_key), advanced, state, strict=True):
+                tensordict.set(_next(key), torch.where(gate, new, old))
+        else:
+            value = self.network.evaluate(inputs)
         mask = None if self.mask_key is None else tensordict.get(self.mask_key)
-        hidden = cell = None
-        if self.network.recurrent:
-            hidden, cell = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
-        value, state = self.network.step(inputs, None, (hidden, cell))
         choice = torch.where(gate.squeeze(-1), self.exploration(value, mask), tensordict.get(self.active_subgoal_key))
-        tensordict.set(self.subgoal_key, choice)
-        if self.network.recurrent:
-            tensordict.set(_next(self.hidden_key), torch.where(gate, state[0], hidden))
-            tensordict.set(_next(self.cell_key), torch.where(gate, state[1], cell))
-        return tensordict
+        return tensordict.set(self.subgoal_key, choice)
 
 
 class HierarchicalPolicy(TensorDictModuleBase):

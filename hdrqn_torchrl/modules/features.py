@@ -12,6 +12,12 @@ from torch import Tensor, nn
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
 
 
+class Features(nn.Module):
+    """A feature extractor: it tells how many features it makes."""
+
+    out_features: int
+
+
 class CellsToImage(nn.Module):
     """Draws cell codes as a colour image, inside the network: replay keeps 25 bytes a view, not 5,808.
 
@@ -28,6 +34,9 @@ class CellsToImage(nn.Module):
         torch.Size([2, 3, 44, 44])
     """
 
+    _pixel_cells: Tensor
+    _colours: Tensor
+
     def __init__(self, view: int, num_codes: int, size: int = 44) -> None:
         super().__init__()
         nearest = nearest_cell(size, view)
@@ -40,7 +49,7 @@ class CellsToImage(nn.Module):
         return self._colours[pixels].movedim(-1, -2).unflatten(-1, (self.size, self.size))
 
 
-class ConvFeatures(nn.Module):
+class ConvFeatures(Features):
     """Four convolutions with ReLU, then one dense layer with ReLU: the paper's image features.
 
     Args:
@@ -84,7 +93,7 @@ class ConvFeatures(nn.Module):
         return features.view(*image.shape[:-3], self.out_features)
 
 
-class CellFeatures(nn.Module):
+class CellFeatures(Features):
     """Cell codes as one-hot vectors through small dense layers: the same information as the image, cheaply.
 
     Args:
@@ -100,6 +109,8 @@ class CellFeatures(nn.Module):
         torch.Size([2, 128])
     """
 
+    _one_hot: Tensor
+
     def __init__(self, view: int, num_codes: int, widths: tuple[int, ...] = (128,)) -> None:
         super().__init__()
         self.register_buffer("_one_hot", torch.eye(num_codes), persistent=False)
@@ -110,7 +121,7 @@ class CellFeatures(nn.Module):
         return self.dense(self._one_hot[cells.flatten(-2).long()].flatten(-2))
 
 
-class FullyConnectedFeatures(nn.Module):
+class FullyConnectedFeatures(Features):
     """Dense layers with ReLU on a vector: what v2's meta-controller puts on the sub-controller's hidden state.
 
     Args:
@@ -128,6 +139,17 @@ class FullyConnectedFeatures(nn.Module):
 
     def forward(self, vector: Tensor) -> Tensor:
         return self.dense(vector)
+
+
+class ChainedFeatures(Features):
+    """A module in front of a feature extractor, such as :class:`CellsToImage` in front of :class:`ConvFeatures`."""
+
+    def __init__(self, first: nn.Module, features: Features) -> None:
+        super().__init__()
+        self.first, self.features, self.out_features = first, features, features.out_features
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return self.features(self.first(observation))
 
 
 def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:

@@ -66,6 +66,14 @@ class _RestartingLSTM(torch.autograd.Function):
         return grad_inputs, None, grad_hidden, grad_cell, grad_weight_ih, grad_weight_hh, flat.sum(0)
 
 
+def lstm_weights(lstm: nn.LSTM) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Weights and biases of the first layer: input to gates, hidden to gates."""
+    weight_ih, weight_hh, bias_ih, bias_hh = (
+        getattr(lstm, name) for name in ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
+    )
+    return weight_ih, weight_hh, bias_ih, bias_hh
+
+
 def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Tensor, Tensor]) -> Tensor:
     """Outputs of a one-layer ``lstm`` (``batch_first``) whose state restarts from zero where ``init`` is set.
 
@@ -86,6 +94,6 @@ def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Te
         True
     """
     keep = (~init).to(inputs.dtype).t().unsqueeze(-1)  # [T, B, 1]
-    bias = lstm.bias_ih_l0 + lstm.bias_hh_l0
+    weight_ih, weight_hh, bias_ih, bias_hh = lstm_weights(lstm)
     by_time = inputs.transpose(0, 1).contiguous()
-    return _RestartingLSTM.apply(by_time, keep, *state, lstm.weight_ih_l0, lstm.weight_hh_l0, bias).transpose(0, 1)
+    return _RestartingLSTM.apply(by_time, keep, *state, weight_ih, weight_hh, bias_ih + bias_hh).transpose(0, 1)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from hdrqn_torchrl.modules.lstm import restarting_lstm
+from hdrqn_torchrl.modules.features import Features
+from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
 
 State = tuple[Tensor, Tensor]
 
@@ -34,7 +35,7 @@ class QNetwork(nn.Module):
             a one-hot vector; 0 for none.
         gate_features: let the condition scale each feature, too, by learned factors. Appended alone it is a faint
             signal: "go to goal k" needs the product of what is seen and which goal is wanted.
-        recurrent: ``False`` replaces the LSTM by a dense layer with ReLU; states then pass through unchanged.
+        recurrent: ``False`` replaces the LSTM by a dense layer with ReLU.
 
     Examples:
         >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
@@ -45,9 +46,11 @@ class QNetwork(nn.Module):
         (torch.Size([3, 4]), torch.Size([3, 5, 4]))
     """
 
+    _one_hot: Tensor
+
     def __init__(
         self,
-        features: nn.Module,
+        features: Features,
         *,
         num_actions: int,
         hidden_size: int,
@@ -87,21 +90,22 @@ class QNetwork(nn.Module):
 
     def _cell(self, features: Tensor, state: State) -> State:
         memory = self.memory
-        return torch.lstm_cell(
-            features, state, memory.weight_ih_l0, memory.weight_hh_l0, memory.bias_ih_l0, memory.bias_hh_l0
-        )
+        assert isinstance(memory, nn.LSTM)
+        return torch.lstm_cell(features, state, *lstm_weights(memory))
 
     def step(self, observation: Tensor, condition: Tensor | None, state: State) -> tuple[Tensor, State]:
         """One decision: Q-values ``[*, A]`` and the state after ``observation`` ``[*, ...]``, ``condition`` ``[*]``."""
         features = self._embed(observation, condition)
-        if not self.recurrent:
-            return self.head(self.memory(features)), state
         if features.ndim == 1:
             hidden, cell = self._cell(features[None], (state[0][None], state[1][None]))
             hidden, cell = hidden[0], cell[0]
         else:
             hidden, cell = self._cell(features, state)
         return self.head(hidden), (hidden, cell)
+
+    def evaluate(self, observation: Tensor, condition: Tensor | None = None) -> Tensor:
+        """Q-values ``[*, A]`` of a network without memory."""
+        return self.head(self.memory(self._embed(observation, condition)))
 
     def unroll(self, observation: Tensor, condition: Tensor | None = None, init: Tensor | None = None) -> Tensor:
         """Q-values along sequences that start from the zero state.
@@ -114,9 +118,9 @@ class QNetwork(nn.Module):
         Returns:
             ``[B, T, A]``.
         """
+        if not isinstance(self.memory, nn.LSTM):
+            return self.evaluate(observation, condition)
         features = self._embed(observation, condition)
-        if not self.recurrent:
-            return self.head(self.memory(features))
         if init is None or not init[:, 1:].any():
             return self.head(self.memory(features)[0])
         return self.head(restarting_lstm(self.memory, features, init, self.initial_state(len(features))))

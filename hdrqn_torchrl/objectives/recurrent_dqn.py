@@ -137,9 +137,10 @@ class RecurrentDQNLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         k, after = self.tensor_keys, tensordict["next"]
-        valid = _steps_of(tensordict.get(k.mask, None), tensordict)
-        if valid is None:
-            valid = torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device)
+        init = _steps_of(tensordict.get(k.init), tensordict)
+        mask = tensordict.get(k.mask, None)
+        valid = torch.ones_like(init) if mask is None else _steps_of(mask, tensordict)
+        init = init & valid
         init = _steps_of(tensordict[k.init], tensordict) & valid
         done, terminated = _steps_of(after[k.done], tensordict), _steps_of(after[k.terminated], tensordict)
 
@@ -147,9 +148,9 @@ class RecurrentDQNLoss(LossModule):
         online, target = self._action_values(inputs)
         chosen = online[:, :-1].gather(-1, tensordict[k.action].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
-            mask = None if k.action_mask is None else inputs.get(k.action_mask)[:, 1:]
+            allowed = None if k.action_mask is None else inputs.get(k.action_mask)[:, 1:]
             chooser = online.detach() if self.double else target
-            next_value = double_q_value(chooser[:, 1:], target[:, 1:], mask)
+            next_value = double_q_value(chooser[:, 1:], target[:, 1:], allowed)
             steps = None if k.steps is None else _steps_of(after[k.steps], tensordict)
             reward = _steps_of(after[k.reward], tensordict)
             wanted = smdp_target(reward, terminated, next_value, self.gamma, steps)
@@ -196,9 +197,9 @@ class RecurrentDQNLoss(LossModule):
             return network(inputs.copy()).get(key), target
 
 
-def _steps_of(value: Tensor | None, tensordict: TensorDictBase) -> Tensor | None:
+def _steps_of(value: Tensor, tensordict: TensorDictBase) -> Tensor:
     """Drops the trailing dimension of a per-step scalar."""
-    return value if value is None or value.ndim == tensordict.ndim else value.squeeze(-1)
+    return value if value.ndim == tensordict.ndim else value.squeeze(-1)
 
 
 def _expand(mask: Tensor, like: Tensor) -> Tensor:
