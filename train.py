@@ -53,46 +53,64 @@ class Schema:
 ConfigStore.instance().store(name="schema", node=Schema)
 
 
+class SettingsError(ValueError):
+    """A setting that breaks its rule, found before training."""
+
+
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(config: DictConfig) -> float:
     """Builds and trains; returns the final greedy return, so that a sweeper can maximise it."""
     try:
         return train(config)
-    except (InstantiationException, ValueError) as error:
-        message = explain(error)
+    except KeyboardInterrupt:
+        sys.exit("interrupted: weights, metrics and summary up to here are in the run folder")
+    except SettingsError as error:
         if HydraConfig.get().mode == RunMode.MULTIRUN:
-            raise ValueError(message) from error
-        sys.exit(f"error: {message}")
+            raise
+        sys.exit(f"error: {error}")
 
 
 def train(config: DictConfig) -> float:
     """One training run in Hydra's run folder."""
-    check(config)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     # torch and torchrl take seconds to load; --help and --cfg do without them.
     import torch
 
-    from hdrqn_torchrl.evaluation import evaluate
-    from hdrqn_torchrl.run_folder import write_results
-
     folder = Path(HydraConfig.get().runtime.output_dir)
     torch.set_num_threads(config.threads)
-    trainer, evaluation_env, references = build(config, folder)
+    try:
+        check(config)
+        trainer, evaluation_env, references = build(config, folder)
+    except (InstantiationException, ValueError) as error:
+        raise SettingsError(explain(error)) from error
     OmegaConf.save(config, folder / "config.yaml", resolve=True)
     try:
         trainer.train()
-    finally:
-        result = evaluate(
-            evaluation_env,
-            trainer.algorithm.policy,
-            episodes=config.evaluation.final_episodes,
-            seed=config.evaluation.seed + 1,
-        )
-        title = " ".join([*(f"{name}={choice}" for name, choice in chosen().items()), f"seed={config.seed}"])
-        summary = write_results(folder, trainer, result, references=references, title=title)
+    except KeyboardInterrupt:
+        write_summary(config, folder, trainer, evaluation_env, references)
+        raise
+    return write_summary(config, folder, trainer, evaluation_env, references)["return_mean"]
+
+
+def write_summary(
+    config: DictConfig, folder: Path, trainer: Trainer, evaluation_env: EnvBase, references: dict
+) -> dict[str, float]:
+    """Final greedy evaluation; writes and prints the run's results."""
+    from hdrqn_torchrl.evaluation import evaluate
+    from hdrqn_torchrl.run_folder import write_results
+
+    result = evaluate(
+        evaluation_env,
+        trainer.algorithm.policy,
+        episodes=config.evaluation.final_episodes,
+        seed=config.evaluation.seed + 1,
+    )
+    choices = HydraConfig.get().runtime.choices
+    title = " ".join([*(f"{name}={choices[name]}" for name in ("env", "algo", "network")), f"seed={config.seed}"])
+    summary = write_results(folder, trainer, result, references=references, title=title)
     print(json.dumps({"run": str(folder), **summary}))
-    return summary["return_mean"]
+    return summary
 
 
 def build(config: DictConfig, folder: Path) -> tuple[Trainer, EnvBase, dict]:
@@ -168,12 +186,6 @@ def pick_device(name: str, has_cuda: bool) -> str:
     return ("cuda" if has_cuda else "cpu") if name == "auto" else name
 
 
-def chosen() -> dict[str, str]:
-    """Which option of each configuration group was chosen."""
-    choices = HydraConfig.get().runtime.choices
-    return {name: choices[name] for name in ("env", "algo", "network")}
-
-
 def explain(error: Exception) -> str:
     """The cause of a failed instantiation, with the full name of the setting in front."""
     if not isinstance(error, InstantiationException):
@@ -182,7 +194,7 @@ def explain(error: Exception) -> str:
     cause = error.__cause__
     if isinstance(cause, ValueError):
         return f"{path}.{cause}" if path else str(cause)
-    return f"{path}: {cause or error}"
+    return f"{path}: {cause or error}; `python train.py --cfg job` shows every setting and its default."
 
 
 if __name__ == "__main__":

@@ -23,13 +23,16 @@ from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid_rules import GridRules, GridState
 from hdrqn_torchrl.modules import EpsilonGreedy, QNetwork, compact_network, paper_network
 
-GAMMA, MAX_STEPS = 0.99, 50
+GAMMA, MAX_STEPS, NUM_GOALS = 0.99, 50, 2
+ONE_HOT = torch.eye(NUM_GOALS)
 
 
 class RawLoop:
     """N worlds with their options and LSTM states, stepped T times a call."""
 
-    def __init__(self, rules: GridRules, meta: QNetwork, sub: QNetwork, *, num_envs: int, steps: int, seed: int) -> None:
+    def __init__(
+        self, rules: GridRules, meta: QNetwork, sub: QNetwork, *, num_envs: int, steps: int, seed: int
+    ) -> None:
         self.rules, self.meta, self.sub, self.num_envs, self.steps = rules, meta, sub, num_envs, steps
         self.generator = torch.Generator().manual_seed(seed)
         self.world = rules.sample(num_envs, self.generator)
@@ -43,7 +46,6 @@ class RawLoop:
         self.sub_state = torch.zeros(2, num_envs, sub.hidden_size).unbind()
         self.meta_state = torch.zeros(2, num_envs, meta.hidden_size).unbind()
         self.storage: dict[str, Tensor] = {}
-        self.columns = torch.arange(rules.num_goals)
 
     @torch.no_grad()
     def collect(self, epsilon: float) -> dict[str, Tensor]:
@@ -113,12 +115,13 @@ class RawLoop:
         """Subgoal where an option starts, then the action; both LSTM states move on."""
         gate = self.starts[:, None]
         value, state = forward(self.meta, self.sub_state[0], self.meta_state)
-        proposal = choose(value.masked_fill(~self.left & self.left.any(1, keepdim=True), -torch.inf), epsilon, self.left)
+        proposal = choose(
+            value.masked_fill(~self.left & self.left.any(1, keepdim=True), -torch.inf), epsilon, self.left
+        )
         self.subgoal = torch.where(self.starts, proposal, self.subgoal)
         self.meta_state = tuple(torch.where(gate, new, old) for new, old in zip(state, self.meta_state, strict=True))
         hidden, cell = (state.masked_fill(gate, 0.0) for state in self.sub_state)
-        condition = (self.subgoal[:, None] == self.columns).float()
-        value, self.sub_state = forward(self.sub, self.observation, (hidden, cell), condition)
+        value, self.sub_state = forward(self.sub, self.observation, (hidden, cell), self.subgoal)
         return choose(value, epsilon)
 
     def restart(self, done: Tensor) -> None:
@@ -136,12 +139,14 @@ class RawLoop:
 
 
 def forward(
-    network: QNetwork, inputs: Tensor, state: tuple[Tensor, ...], condition: Tensor | None = None
+    network: QNetwork, inputs: Tensor, state: tuple[Tensor, ...], subgoal: Tensor | None = None
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Q-values and the state after one input, straight from the layers of a network."""
     features = network.features(inputs)
-    if condition is not None:
-        features = torch.cat([features, condition], 1)
+    if subgoal is not None:
+        if network.gate is not None:
+            features = features * network.gate(subgoal)
+        features = torch.cat([features, ONE_HOT[subgoal]], 1)
     lstm = network.memory
     hidden, cell = torch.lstm_cell(
         features, state, lstm.weight_ih_l0, lstm.weight_hh_l0, lstm.bias_ih_l0, lstm.bias_hh_l0
@@ -166,7 +171,7 @@ def choose(value: Tensor, epsilon: float, allowed: Tensor | None = None) -> Tens
 def make(network: str, num_envs: int, epsilon: float) -> tuple[Algorithm, MultiGoalGridEnv, TransformedEnv]:
     """hDRQNv2 on the two-goal gridworld, exploring at a constant rate."""
     torch.manual_seed(0)
-    env = MultiGoalGridEnv(num_envs=num_envs, max_steps=MAX_STEPS)
+    env = MultiGoalGridEnv(num_envs=num_envs, num_goals=NUM_GOALS, max_steps=MAX_STEPS)
     algorithm = make_hdrqn(
         env,
         {"compact": compact_network, "paper": paper_network}[network](),
@@ -192,12 +197,16 @@ def check_equal(algorithm: Algorithm, env: MultiGoalGridEnv, transformed: Transf
         ours = transformed.rollout(steps, algorithm.policy, break_when_any_done=False)
     raw = raw_loop(algorithm, env, steps=steps, seed=7).collect(epsilon=0.0)
     after: TensorDictBase = ours["next"]
-    same = {name: ours[name] for name in ("observation", "action", "option_init", "is_init", "subgoal_mask", "sub_hidden")}
+    same = {
+        name: ours[name] for name in ("observation", "action", "option_init", "is_init", "subgoal_mask", "sub_hidden")
+    }
     same |= {"subgoal": after["active_subgoal"], "next_observation": after["observation"]}
     same |= {f"next_{name}": after[name] for name in ("subgoal_mask", "sub_hidden")}
     same |= {name: after[name] for name in raw if name in after.keys() and name not in same}
     for name, value in same.items():
-        torch.testing.assert_close(value.view_as(raw[name]), raw[name], atol=1e-5, rtol=1e-5, msg=lambda m, n=name: f"{n}: {m}")
+        torch.testing.assert_close(
+            value.view_as(raw[name]), raw[name], atol=1e-5, rtol=1e-5, msg=lambda m, n=name: f"{n}: {m}"
+        )
     assert bool(after["done"].any()), "the comparison must include ends of episodes"
 
 

@@ -16,7 +16,6 @@ import torch
 from tensordict import TensorDictBase
 from timing import compare
 from torch import Tensor, nn
-from torch.nn.functional import one_hot
 from torchrl.collectors import Collector
 
 from hdrqn_torchrl.algorithms import Algorithm, make_hdrqn
@@ -26,6 +25,7 @@ from hdrqn_torchrl.modules import QNetwork, compact_network, paper_network
 
 Batch = dict[str, Tensor]
 GAMMA, TAU, LEARNING_RATE, MAX_GRAD_NORM = 0.99, 1e-3, 1e-3, 10.0
+LAYERS = {"features": "features", "gate": "gate", "memory": "lstm", "head": "streams"}  # of QNetwork: of RawQNetwork
 
 
 class RawQNetwork(nn.Module):
@@ -33,15 +33,16 @@ class RawQNetwork(nn.Module):
 
     def __init__(self, network: QNetwork) -> None:
         super().__init__()
-        self.features = deepcopy(network.features)
-        self.lstm = deepcopy(network.memory)
-        self.streams = deepcopy(network.head.streams)
-        self.num_conditions, self.hidden_size = network.num_conditions, network.hidden_size
+        self.features, self.gate = deepcopy(network.features), deepcopy(network.gate)
+        self.lstm, self.streams = deepcopy(network.memory), deepcopy(network.head.streams)
+        self.hidden_size, self.one_hot = network.hidden_size, torch.eye(network.num_conditions)
 
     def forward(self, observation: Tensor, subgoal: Tensor | None, init: Tensor | None) -> Tensor:
         features = self.features(observation)
         if subgoal is not None:
-            features = torch.cat([features, one_hot(subgoal, self.num_conditions).float()], -1)
+            if self.gate is not None:
+                features = features * self.gate(subgoal)
+            features = torch.cat([features, self.one_hot[subgoal]], -1)
         outputs = self.lstm(features)[0] if init is None else self.restarting(features, init)
         streams = self.streams(outputs)
         value, advantage = streams[..., :1], streams[..., 1:]
@@ -60,23 +61,19 @@ class RawQNetwork(nn.Module):
 
 
 class RawReplay:
-    """Rows ``[M, ...]`` with each episode in one piece; draws a random episode, then a random start in it."""
+    """Rows ``[M, ...]`` with each episode in one piece; draws sequences that start at a random row."""
 
     def __init__(self, rows: Batch, episode: Tensor, slice_len: int, batch_size: int) -> None:
         self.rows, self.batch_size, self.offsets = rows, batch_size, torch.arange(slice_len)
-        _, self.lengths = episode.unique_consecutive(return_counts=True)
-        self.starts = self.lengths.cumsum(0) - self.lengths
-        self.slack = (self.lengths - slice_len + 1).clamp(min=1)
+        _, lengths = episode.unique_consecutive(return_counts=True)
+        self.last = (lengths.cumsum(0) - 1).repeat_interleave(lengths)  # last row of each row's episode
 
     def sample(self) -> Batch:
-        episode = torch.randint(len(self.starts), (self.batch_size,))
-        start = (torch.rand(self.batch_size) * self.slack[episode]).long()[:, None]
-        offset = start + self.offsets
-        last = self.lengths[episode][:, None] - 1
-        index = self.starts[episode][:, None] + torch.minimum(offset, last)
-        batch = {name: values[index] for name, values in self.rows.items()}
-        batch["valid"] = offset <= last
-        return batch
+        start = torch.randint(len(self.last), (self.batch_size, 1))
+        index, last = start + self.offsets, self.last[start]
+        valid = index <= last
+        index = torch.minimum(index, last)
+        return {name: values[index] for name, values in self.rows.items()} | {"valid": valid}
 
 
 class RawLearner:
@@ -90,7 +87,7 @@ class RawLearner:
 
     def loss(self, batch: Batch) -> Tensor:
         valid, init = batch["valid"], batch["init"] & batch["valid"]
-        stream, next_mask = self.stream(batch, "observation"), None
+        stream = self.stream(batch, "observation")
         subgoal = self.stream(batch, "condition") if "condition" in batch else None
         restart = torch.cat([init, torch.zeros_like(init[:, :1])], 1) if "condition" in batch else None
         with torch.no_grad():
@@ -151,7 +148,9 @@ def flatten(level: str, version: str, steps: TensorDictBase) -> Batch:
         },
     }[level]
     batch = {name: steps[key] for name, key in source.items()}
-    batch |= {f"next_{name}": steps["next", source[name]] for name in ("observation", "condition", "mask") if name in source}
+    batch |= {
+        f"next_{name}": steps["next", source[name]] for name in ("observation", "condition", "mask") if name in source
+    }
     per_step = ("init", "reward", "steps", "done", "terminated")
     return {name: value.squeeze(-1) if name in per_step else value for name, value in batch.items()}
 
@@ -173,12 +172,14 @@ def check_equal(learner: Learner, raw: RawLearner, level: str, version: str) -> 
     for _ in range(5):
         sample = learner.sample()
         batch = flatten(level, version, sample)
-        batch["valid"] = sample["collector", "mask"] if ("collector", "mask") in sample.keys(True) else torch.ones(sample.shape, dtype=torch.bool)
+        batch["valid"] = sample["collector", "mask"]
         ours, reference = learner.loss(sample)["loss"], raw.loss(batch)
         torch.testing.assert_close(ours, reference, atol=1e-5, rtol=1e-5)
-        gradients = torch.autograd.grad(ours, list(learner.network.network.parameters()))
-        for gradient, expected in zip(gradients, torch.autograd.grad(reference, raw.parameters), strict=True):
-            torch.testing.assert_close(gradient, expected, atol=1e-5, rtol=1e-3)
+        network = learner.network.network
+        layers = [(getattr(network, name), getattr(raw.online, twin)) for name, twin in LAYERS.items()]
+        pairs = [pair for mine, other in layers if mine for pair in zip(mine.parameters(), other.parameters())]
+        gradients = (torch.autograd.grad(value, list(side)) for value, side in zip((ours, reference), zip(*pairs)))
+        torch.testing.assert_close(*gradients, atol=1e-5, rtol=1e-3)
 
 
 def filled(version: str, network: str, batches: int) -> Algorithm:
@@ -196,7 +197,10 @@ def filled(version: str, network: str, batches: int) -> Algorithm:
         meta=LearnerSettings(slice_len=1, capacity=50_000, **settings),
     )
     collector = Collector(
-        algorithm.transform(env), algorithm.policy, frames_per_batch=64 * 8, total_frames=64 * 8 * batches,
+        algorithm.transform(env),
+        algorithm.policy,
+        frames_per_batch=64 * 8,
+        total_frames=64 * 8 * batches,
         auto_register_policy_transforms=False,
     )
     for batch in collector:

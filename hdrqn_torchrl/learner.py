@@ -36,6 +36,7 @@ class LearnerSettings:
             :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
+        max_target: largest return there can be, if known; targets are cut off above it.
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -54,6 +55,7 @@ class LearnerSettings:
     sampling: Literal["steps", "episodes"] = "steps"
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
+    max_target: float | None = None
 
     def __post_init__(self) -> None:
         rules = (
@@ -107,6 +109,7 @@ class Learner:
             train_exact_states=settings.train_exact_states,
             loss_function=settings.loss_function,
             double=settings.double,
+            max_target=settings.max_target,
         )
         self.loss.set_keys(**loss_keys)
         self.target_updater = SoftUpdate(self.loss, tau=settings.tau)

@@ -119,6 +119,7 @@ class GridRules:
         self.moves = self._move_table(is_wall).to(device)
         bare, slots = self._window_tables(is_wall)
         self._bare_windows, self._window_slots = bare.to(device), slots.to(device)
+        self.window_cells = self._window_cell_table(slots).to(device)
         codes = [OBSTACLE] * num_obstacles + [FIRST_GOAL + index for index in range(num_goals)]
         self._object_codes = torch.tensor(codes, dtype=torch.uint8, device=device)
         self._goal_bits = (2 ** torch.arange(num_goals)).to(device)
@@ -152,6 +153,12 @@ class GridRules:
         contents = torch.where(is_wall, WALL, FLOOR).to(torch.uint8).expand(self.nowhere, -1)
         bare.scatter_(1, slots[:, : self.nowhere], contents)
         return bare, slots
+
+    def _window_cell_table(self, slots: Tensor) -> Tensor:
+        """Cell shown at each place of the window around each cell, ``[cells, view * view]``; outside is ``nowhere``."""
+        table = torch.full((self.nowhere, self.view * self.view + 1), self.nowhere)
+        table.scatter_(1, slots[:, : self.nowhere], torch.arange(self.nowhere).expand(self.nowhere, -1))
+        return table[:, :-1].contiguous()
 
     def sample(self, num_worlds: int, generator: torch.Generator | None = None) -> GridState:
         """Puts the agent and all objects of ``num_worlds`` new worlds on distinct random free cells."""

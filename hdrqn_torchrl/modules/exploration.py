@@ -39,7 +39,7 @@ class EpsilonGreedy(nn.Module):
         super().__init__()
         for name, value in (("start", start), ("end", end)):
             if not 0.0 <= value <= 1.0:
-                raise ValueError(f"epsilon {name} must lie in [0, 1], got {value}; the paper goes from 1.0 to 0.1.")
+                raise ValueError(f"{name} must be an epsilon in [0, 1], got {value}; the paper goes from 1.0 to 0.1.")
         if anneal_frames < 1:
             raise ValueError(f"anneal_frames must be >= 1, got {anneal_frames}; use start == end for a constant.")
         self.start, self.end, self.anneal_frames = start, end, anneal_frames

@@ -12,57 +12,59 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-_aten = torch.ops.aten
-
 
 class _RestartingLSTM(torch.autograd.Function):
     @staticmethod
     def forward(ctx, inputs, keep, hidden, cell, weight_ih, weight_hh, bias):  # noqa: ANN001, ANN205
         time, size = len(inputs), hidden.shape[-1]
         gates = torch.addmm(bias, inputs.flatten(0, 1), weight_ih.t()).unflatten(0, (time, -1))  # [T, B, 4H]
+        write_and_forget = gates[..., : 2 * size]
+        write, forget, update, read = gates.chunk(4, -1)  # views, filled step by step
+        hiddens, cells, squashed, outputs = gates.new_empty((4, time, *hidden.shape)).unbind()
         weight_hh_t = weight_hh.t()
-        hiddens, before, cells, squashed = [], [], [], []
         for step in range(time):
-            hidden, cell = hidden * keep[step], cell * keep[step]
-            before.append(hidden)
-            cells.append(cell)
-            gate = gates[step].addmm_(hidden, weight_hh_t)
-            gate[:, : 2 * size].sigmoid_()
-            gate[:, 2 * size : 3 * size].tanh_()
-            gate[:, 3 * size :].sigmoid_()
-            write, forget, update, read = gate.chunk(4, -1)
-            cell = torch.addcmul(forget * cell, write, update)
-            squash = cell.tanh()
-            hidden = read * squash
-            squashed.append(squash)
-            hiddens.append(hidden)
+            torch.mul(hidden, keep[step], out=hiddens[step])
+            torch.mul(cell, keep[step], out=cells[step])
+            gates[step].addmm_(hiddens[step], weight_hh_t)
+            write_and_forget[step].sigmoid_()
+            update[step].tanh_()
+            read[step].sigmoid_()
+            cell = torch.addcmul(forget[step] * cells[step], write[step], update[step])
+            torch.tanh(cell, out=squashed[step])
+            hidden = torch.mul(read[step], squashed[step], out=outputs[step])
         if any(ctx.needs_input_grad):
-            ctx.save_for_backward(inputs, keep, weight_ih, weight_hh, gates, *before, *cells, *squashed)
-        return torch.stack(hiddens)
+            ctx.save_for_backward(inputs, keep, weight_ih, weight_hh, gates, hiddens, cells, squashed)
+        return outputs
 
     @staticmethod
     @once_differentiable
     def backward(ctx, grad):  # noqa: ANN001, ANN205
-        inputs, keep, weight_ih, weight_hh, gates, *saved = ctx.saved_tensors
-        time = len(inputs)
-        before, cells, squashed = saved[:time], saved[time : 2 * time], saved[2 * time :]
-        grad_gates = torch.empty_like(gates)
+        inputs, keep, weight_ih, weight_hh, gates, hiddens, cells, squashed = ctx.saved_tensors
+        write, forget, update, read = gates.chunk(4, -1)
+        # How the cell (first three gates) and the output (last gate) answer to each gate's input, for all steps at
+        # once; multiplied in place by their gradients below, this becomes the gradient of the gates.
+        grad_gates = gates - gates * gates
+        of_write, of_forget, of_update, of_read = grad_gates.chunk(4, -1)
+        of_write *= update
+        of_forget *= cells
+        torch.addcmul(write, write, update * update, value=-1, out=of_update)
+        of_read *= squashed
+        by_cell = grad_gates.unflatten(-1, (4, -1))[..., :3, :]
+        output_by_cell = torch.addcmul(read, read, squashed * squashed, value=-1)
+        cell_by_cell = forget * keep
+
         grad_hidden = grad_cell = torch.zeros_like(grad[0])
-        for step in reversed(range(time)):
-            write, forget, update, read = gates[step].chunk(4, -1)
-            to_write, to_forget, to_update, to_read = grad_gates[step].chunk(4, -1)
-            total = grad[step] + grad_hidden
-            through_cell = grad_cell + _aten.tanh_backward(total * read, squashed[step])
-            _aten.sigmoid_backward.grad_input(through_cell * update, write, grad_input=to_write)
-            _aten.sigmoid_backward.grad_input(through_cell * cells[step], forget, grad_input=to_forget)
-            _aten.tanh_backward.grad_input(through_cell * write, update, grad_input=to_update)
-            _aten.sigmoid_backward.grad_input(total * squashed[step], read, grad_input=to_read)
-            grad_hidden = (grad_gates[step] @ weight_hh) * keep[step]
-            grad_cell = through_cell * forget * keep[step]
+        for step in reversed(range(len(inputs))):
+            grad_hidden = grad_hidden + grad[step]
+            grad_cell = torch.addcmul(grad_cell, grad_hidden, output_by_cell[step])
+            by_cell[step] *= grad_cell.unsqueeze(1)
+            of_read[step] *= grad_hidden
+            grad_hidden = (grad_gates[step] @ weight_hh).mul_(keep[step])
+            grad_cell = grad_cell * cell_by_cell[step]
         flat = grad_gates.flatten(0, 1)
         grad_inputs = (flat @ weight_ih).view_as(inputs) if ctx.needs_input_grad[0] else None
         grad_weight_ih = flat.t() @ inputs.flatten(0, 1)
-        grad_weight_hh = flat.t() @ torch.cat(before)
+        grad_weight_hh = flat.t() @ hiddens.flatten(0, 1)
         return grad_inputs, None, grad_hidden, grad_cell, grad_weight_ih, grad_weight_hh, flat.sum(0)
 
 

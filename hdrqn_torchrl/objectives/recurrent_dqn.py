@@ -45,6 +45,8 @@ class RecurrentDQNLoss(LossModule):
         train_exact_states: train leading steps, too, whose recurrent state is exact.
         double: choose the next action by the main network (Double DQN) instead of the target network.
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
+        max_target: targets are cut off above this value: the largest return there can be, where it is known. It
+            stops the overestimation that bootstrapping builds up while rewards are still rare.
         delay_value: whether a target network is kept (update it with TorchRL's ``SoftUpdate`` or ``HardUpdate``).
 
     Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
@@ -96,6 +98,7 @@ class RecurrentDQNLoss(LossModule):
         train_exact_states: bool = True,
         double: bool = True,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
+        max_target: float | None = None,
         delay_value: bool = True,
     ) -> None:
         if not 0.0 <= gamma <= 1.0:
@@ -115,7 +118,7 @@ class RecurrentDQNLoss(LossModule):
         self.__dict__["_networks"] = (value_network, target)
         self.register_buffer("gamma", torch.tensor(gamma))
         self.burn_in, self.train_exact_states = burn_in, train_exact_states
-        self.double, self.loss_function = double, loss_function
+        self.double, self.loss_function, self.max_target = double, loss_function, max_target
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -154,6 +157,8 @@ class RecurrentDQNLoss(LossModule):
             steps = None if k.steps is None else _steps_of(after[k.steps], tensordict)
             reward = _steps_of(after[k.reward], tensordict)
             wanted = smdp_target(reward, terminated, next_value, self.gamma, steps)
+            if self.max_target is not None:
+                wanted = wanted.clamp(max=self.max_target)
             trained = training_mask(valid, init, self.burn_in, self.train_exact_states)
             trained = trained & ~_ends_unseen(done & ~terminated, valid)
             count = trained.sum().clamp(min=1)

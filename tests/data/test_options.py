@@ -1,0 +1,190 @@
+from functools import cache
+
+import pytest
+import torch
+from helpers import subgoal_env
+
+from hdrqn_torchrl.data import OptionExtractor, StepSelector
+
+SHAPES = [(1, 2), (3, 2), (3, 3), (6, 17), (5, 1), (1, 17)]
+
+
+@cache
+def make_steps(num_envs, length, seed=0, first_traj=0):
+    """Consecutive steps ``[N, length]`` of random play; episodes last up to 5 steps."""
+    torch.manual_seed(seed)
+    env = subgoal_env(num_envs, env_settings={"max_steps": 5, "seed": seed}, max_option_steps=3)
+    steps = env.rollout(length, break_when_any_done=False)
+    episode = steps["is_init"].squeeze(-1).cumsum(-1) - 1
+    steps["collector", "traj_ids"] = first_traj + episode + 1_000 * torch.arange(num_envs)[:, None]
+    steps["extra"], steps["next", "extra"] = torch.rand(2, num_envs, length)
+    return steps
+
+
+def batches_of(steps, length):
+    return [steps[:, start : start + length] for start in range(0, steps.shape[1] - length + 1, length)]
+
+
+class PlainExtractor:
+    """The same by a loop over environments and steps; an option is (start step, end step)."""
+
+    def __init__(self):
+        self.open, self.held = {}, {}
+
+    def __call__(self, batch):
+        released = []
+        for n in range(len(batch)):
+            flags = (batch["option_init"][n], batch["next", "option_done"][n], batch["next", "done"][n])
+            for t, (starts, ends, last) in enumerate(torch.cat(flags, -1).tolist()):
+                if starts:
+                    self.open[n] = batch[n, t]
+                if ends and n in self.open:
+                    self.held.setdefault(n, []).append((self.open.pop(n), batch[n, t]))
+                if last:
+                    released += self.held.pop(n, [])
+        return released
+
+
+def assert_same(options, expected):
+    if not expected:
+        assert options is None
+        return
+    assert options.shape == (len(expected),)
+    start, end = (torch.stack(steps) for steps in zip(*expected, strict=True))
+    for key in ("observation", "subgoal_mask", "is_init", ("collector", "traj_ids")):
+        assert (options[key] == start[key]).all(), key
+    for key in ("observation", "subgoal_mask", "option_steps", "option_return", "done", "terminated", "truncated"):
+        assert (options["next", key] == end["next", key]).all(), key
+    assert (options["subgoal"] == end["next", "active_subgoal"]).all()
+
+
+@pytest.mark.parametrize(("num_envs", "length"), SHAPES)
+class TestAgainstPlainLoops:
+    def test_over_many_batches(self, num_envs, length):
+        extractor, plain, options = OptionExtractor(), PlainExtractor(), 0
+        for batch in batches_of(make_steps(num_envs, 102), length):
+            expected = plain(batch)
+            assert_same(extractor(batch), expected)
+            options += len(expected)
+        assert options >= 20 * num_envs
+
+    def test_when_the_first_batch_begins_in_mid_episode(self, num_envs, length):
+        steps = make_steps(num_envs, 54)
+        steps = steps[:, 2:] if num_envs > 1 else steps[:, 1:]
+        assert not steps["option_init"][:, 0].all()
+        extractor, plain = OptionExtractor(), PlainExtractor()
+        for batch in batches_of(steps, length):
+            assert_same(extractor(batch), plain(batch))
+
+    def test_when_all_environments_are_reset_between_two_batches(self, num_envs, length):
+        extractor, plain = OptionExtractor(), PlainExtractor()
+        whole = 4 * length if length > 5 else 6 * length + (0 if length > 1 else 2)
+        for part in range(3):
+            steps = make_steps(num_envs, whole, seed=part, first_traj=100 * part)
+            for batch in batches_of(steps, length):
+                assert_same(extractor(batch), plain(batch))
+
+    def test_a_state_dict_carries_it_over(self, num_envs, length):
+        extractor, plain = OptionExtractor(), PlainExtractor()
+        for batch in batches_of(make_steps(num_envs, 51), length):
+            successor = OptionExtractor()
+            successor.load_state_dict(extractor.state_dict())
+            extractor = successor
+            assert_same(extractor(batch), plain(batch))
+
+
+class TestOptions:
+    def extract(self, **settings):
+        extractor = OptionExtractor(**settings)
+        taken = [extractor(batch) for batch in batches_of(make_steps(6, 102), 6)]
+        return torch.cat([options for options in taken if options is not None], 0)
+
+    def test_the_end_of_an_option_is_the_start_of_the_next_and_differs_from_its_own_start(self):
+        options = self.extract()
+        same = options["collector", "traj_ids"][1:] == options["collector", "traj_ids"][:-1]
+        assert same.any()
+        for key in ("observation", "subgoal_mask"):
+            assert (options[key][1:] == options["next", key][:-1])[same].all()
+        moved = (options["observation"] != options["next", "observation"]).flatten(1).any(-1)
+        assert moved.float().mean() > 0.7  # an overwritten start would make it 0
+
+    def test_episodes_come_out_whole_and_in_one_piece(self):
+        options = self.extract()
+        traj = options["collector", "traj_ids"]
+        assert len(traj.unique_consecutive()) == len(traj.unique())
+        first = torch.cat([torch.tensor([True]), traj[1:] != traj[:-1]])
+        last = torch.cat([traj[1:] != traj[:-1], torch.tensor([True])])
+        assert (options["is_init"].squeeze(-1) == first).all()
+        assert (options["next", "done"].squeeze(-1) == last).all()
+
+    def test_every_step_of_the_finished_episodes_belongs_to_one_option(self):
+        steps, extractor = make_steps(6, 102), OptionExtractor()
+        options = extractor(steps)
+        finished = sum(
+            int(env["next", "done"].squeeze(-1).nonzero().max()) + 1 for env in steps.unbind(0)
+        )  # steps up to the last end of an episode
+        assert options["next", "option_steps"].sum() == finished
+
+    def test_only_what_is_asked_for_is_kept(self):
+        options = self.extract(input_keys=["extra"], mask_key=None)
+        assert set(options.keys(True, True)) == {
+            "extra", "is_init", "subgoal", ("collector", "traj_ids"), ("next", "extra"), ("next", "option_steps"),
+            ("next", "option_return"), ("next", "done"), ("next", "terminated"), ("next", "truncated"),
+        }  # fmt: skip
+
+    def test_at_end_changes_what_is_kept_from_the_end_and_nothing_else(self):
+        plain = self.extract(input_keys=["observation"])
+        changed = self.extract(at_end=lambda after: after.set("observation", after["observation"] + 1))
+        assert (changed["next", "observation"] == plain["next", "observation"] + 1).all()
+        assert (changed["observation"] == plain["observation"]).all()
+
+    def test_reset_forgets_options_and_episodes_in_progress(self):
+        steps = make_steps(6, 20)
+        extractor, plain = OptionExtractor(), PlainExtractor()
+        extractor(steps[:, :8])
+        extractor.reset()
+        for batch in batches_of(steps[:, 8:], 4):
+            assert_same(extractor(batch), plain(batch))
+
+    def test_keys_can_be_renamed(self):
+        names = ("option_init", "option_done", "option_steps", "option_return", "active_subgoal")
+        steps, plain = make_steps(4, 30), OptionExtractor()
+        renamed = steps.clone()
+        for name in names:
+            for part in (renamed, renamed["next"]):
+                if name in part:
+                    part["book", name] = part.pop(name)
+        renamed["first"] = renamed.pop("is_init")
+        renamed["episode"] = renamed.pop(("collector", "traj_ids"))
+        keys = {f"{name}_key": ("book", name) for name in names}
+        extractor = OptionExtractor(**keys, init_key="first", traj_key="episode", subgoal_key=("book", "chosen"))
+        options, expected = extractor(renamed), plain(steps)
+        assert (options["book", "chosen"] == expected["subgoal"]).all()
+        assert (options["next", "book", "option_return"] == expected["next", "option_return"]).all()
+        assert (options["first"] == expected["is_init"]).all()
+
+
+class TestStepSelector:
+    def test_it_keeps_what_is_asked_for_and_the_ends_of_the_episode(self):
+        select = StepSelector(root_keys=["observation"], next_keys=["extra"])
+        steps = make_steps(2, 6)
+        kept = select(steps)
+        assert set(kept.keys(True, True)) == {
+            "observation", ("collector", "traj_ids"), ("next", "extra"), ("next", "done"), ("next", "terminated"),
+            ("next", "truncated"),
+        }  # fmt: skip
+        assert (kept["next", "extra"] == steps["next", "extra"]).all()
+
+    def test_the_subgoal_in_force_stands_on_both_sides_of_a_step(self):
+        steps = make_steps(4, 30)
+        kept = StepSelector(root_keys=["subgoal"], next_keys=["observation"], subgoal_key="subgoal")(steps)
+        assert (kept["subgoal"] == steps["next", "active_subgoal"]).all()
+        assert (kept["next", "subgoal"] == steps["next", "active_subgoal"]).all()
+        assert (kept["subgoal"] != steps["subgoal"]).any()  # random play proposes at every step
+
+    def test_the_batch_is_left_as_it_was(self):
+        steps = make_steps(2, 6)
+        before = steps.clone()
+        StepSelector(root_keys=["subgoal"], next_keys=["observation"], subgoal_key="subgoal")(steps)
+        OptionExtractor()(steps)
+        assert (steps == before).all()

@@ -1,0 +1,218 @@
+import pytest
+import torch
+from helpers import ALGORITHMS, build, collect, make_collector, small_env, tiny_settings
+from torchrl.envs.utils import check_env_specs
+
+from hdrqn_torchrl.algorithms import make_hdqn, make_hdrqn
+from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.modules import EpsilonGreedy, compact_network, paper_network
+
+NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
+
+
+@pytest.mark.parametrize("layout", ["open", "four_rooms"])
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("dqn", {}),
+        ("drqn", {}),
+        ("hdqn", {}),
+        ("v1", {}),
+        ("v2", {}),
+        ("v2", {"meta_input": "cell"}),
+        ("v2", {"meta_input": "both"}),
+        ("v2", {"meta_input_time": "after_last_observation"}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "-".join(value.values()),
+)
+def test_every_algorithm_collects_and_updates_each_level(name, options, network, layout):
+    torch.manual_seed(0)
+    env = MultiGoalGridEnv(4, layout=layout, max_steps=6, seed=0)
+    algorithm = build(name, env, NETWORKS[network], settings=tiny_settings(batch_size=16), **options)
+    assert list(algorithm.learners) == (["flat"] if name in ("dqn", "drqn") else ["sub", "meta"])
+    assert list(algorithm.explorations) == list(algorithm.learners)
+    batch = collect(algorithm, env, 8)[0]
+    for learner in algorithm.learners.values():
+        before = [p.detach().clone() for p in learner.network.parameters()]
+        learner.store(batch)
+        metrics = learner.update(learner.sample())
+        assert metrics["loss"] > 0 and metrics["trained_steps"] > 0
+        assert any((p != old).any() for p, old in zip(learner.network.parameters(), before, strict=True))
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_environment_as_the_algorithm_sees_it_keeps_its_specs(name):
+    env = small_env(3)
+    check_env_specs(build(name, env).transform(env))
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_the_policy_is_made_of_what_the_learners_train(name):
+    algorithm = build(name, small_env(3))
+    trained = {id(p) for learner in algorithm.learners.values() for p in learner.network.parameters()}
+    assert trained == {id(p) for p in algorithm.policy.parameters()}
+    epsilons = {id(level.epsilon) for level in algorithm.explorations.values()}
+    assert epsilons <= {id(buffer) for buffer in algorithm.policy.buffers()}
+
+
+class TestOptions:
+    """Each option changes something."""
+
+    def steps(self, batches=1, name="v2", **options):
+        torch.manual_seed(0)
+        env = small_env(8)
+        algorithm = build(name, env, **options)
+        batch = torch.cat(collect(algorithm, env, 30, batches), 1)
+        return algorithm, batch
+
+    def test_gamma_and_smdp_discount(self):
+        algorithm, batch = self.steps(gamma=0.5)
+        gammas = [learner.loss.gamma.item() for learner in algorithm.learners.values()]
+        assert gammas == [0.5, 0.5]
+        returns = batch["next", "option_return"]
+        ends = batch["next", "subgoal_reached"] & (batch["next", "option_steps"] > 1)
+        assert ends.any() and (returns[ends] < 1.0).all()
+        algorithm, batch = self.steps(gamma=0.5, smdp_discount=False)
+        returns, steps = batch["next", "option_return"], batch["next", "option_steps"]
+        assert ((returns * 100).round() == returns * 100).all() and (returns[steps > 1] >= 1.0).any()
+
+    @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
+    def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):
+        algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount)
+        meta = algorithm.learners["meta"]
+        options = meta.extract(batch)[None, :1]
+        options["next", "terminated"].fill_(False)
+        options["is_init"].fill_(True)
+        options["next", "option_steps"].fill_(3)
+        options["next", "option_return"].fill_(0.25)
+        with torch.no_grad():
+            for parameter in meta.loss.target_value_network_params["network", "head", "streams"].values():
+                parameter.zero_()
+            meta.loss.target_value_network_params["network", "head", "streams", "bias"][0] = 8.0  # Q' = 8
+        assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
+
+    def test_mask_reached(self):
+        for mask_reached in (True, False):
+            _, batch = self.steps(batches=3, mask_reached=mask_reached)
+            starts = batch["option_init"].squeeze(-1)
+            allowed = batch["subgoal_mask"].gather(-1, batch["subgoal"].unsqueeze(-1))[starts]
+            assert allowed.all() == mask_reached
+
+    def test_repeatable_subgoals(self):
+        for repeatable in (True, False):
+            _, batch = self.steps(repeatable_subgoals=repeatable)
+            assert batch["subgoal_mask"].all() == repeatable
+
+    def test_rewards(self):
+        _, batch = self.steps(batches=3)
+        assert batch["next", "intrinsic_reward"].unique().tolist() == [-1.0, 0.0, 1.0]
+        _, batch = self.steps(batches=3, hazard_reward=-0.25, wrong_subgoal_reward=-0.5)
+        assert batch["next", "intrinsic_reward"].unique().tolist() == [-0.5, -0.25, 0.0, 1.0]
+
+    def test_max_option_steps(self):
+        for limit in (None, 3):
+            _, batch = self.steps(max_option_steps=limit)
+            assert batch["next", "option_steps"].max() == (limit or 7)
+
+    @pytest.mark.parametrize(
+        ("options", "entries"),
+        [
+            ({"version": "v1"}, {"observation"}),
+            ({}, {"sub_hidden"}),
+            ({"meta_input": "cell"}, {"sub_cell"}),
+            ({"meta_input": "both"}, {"sub_hidden", "sub_cell"}),
+        ],
+        ids=str,
+    )
+    def test_version_and_meta_input(self, options, entries):
+        options = dict(options)
+        algorithm, batch = self.steps(name=options.pop("version", "v2"), **options)
+        stored = algorithm.learners["meta"].extract(batch)
+        assert entries == {"observation", "sub_hidden", "sub_cell"} & set(stored.keys())
+
+    def test_meta_input_time(self):
+        policies = [
+            build("v2", small_env(2), meta_input_time=time).policy
+            for time in ("after_last_decision", "after_last_observation")
+        ]
+        assert [policy.read_last_observation for policy in policies] == [False, True]
+
+    def test_settings_and_schedules_reach_their_level(self):
+        sub, meta = tiny_settings(slice_len=3), tiny_settings(slice_len=2)
+        schedules = EpsilonGreedy(0.5, 0.5), EpsilonGreedy(0.25, 0.25)
+        algorithm = make_hdrqn(
+            small_env(2),
+            NETWORKS["compact"],
+            sub=sub,
+            meta=meta,
+            sub_exploration=schedules[0],
+            meta_exploration=schedules[1],
+        )
+        assert algorithm.learners["sub"].settings is sub and algorithm.learners["meta"].settings is meta
+        policy = algorithm.policy
+        assert policy.sub_controller.exploration is algorithm.explorations["sub"] is schedules[0]
+        assert policy.meta_controller.exploration is algorithm.explorations["meta"] is schedules[1]
+
+    def test_flat_agents_learn_from_the_total_reward(self):
+        algorithm, batch = self.steps(name="drqn")
+        stored = algorithm.learners["flat"].extract(batch)
+        assert (stored["next", "reward"] == batch["next", "reward"]).all()
+        assert (batch["next", "reward"] == -1).any()
+
+    def test_sub_and_meta_learn_from_their_own_rewards(self):
+        algorithm, batch = self.steps()
+        sub, meta = (algorithm.learners[level].extract(batch) for level in ("sub", "meta"))
+        assert (sub["next", "intrinsic_reward"] == batch["next", "intrinsic_reward"]).all()
+        assert not any("reward" in stored["next"] for stored in (sub, meta))
+        assert meta["next", "option_return"].min() >= 0  # obstacles are no business of the meta-controller
+
+    @pytest.mark.parametrize(
+        ("make", "options", "message"),
+        [
+            (make_hdrqn, {"version": "v9"}, "version must be 'v1' or 'v2', got 'v9'; "),
+            (make_hdrqn, {"version": "v2", "recurrent": False}, "version='v2' needs recurrent=True.*; "),
+            (make_hdrqn, {"meta_input": "all"}, "meta_input must be one of .*, got 'all'; "),
+            (make_hdrqn, {"meta_input_time": "never"}, "meta_input_time must be .*, got 'never'; "),
+            (make_hdqn, {"gamma": 2.0}, r"gamma must lie in \[0, 1\], got 2.0; "),
+        ],
+    )
+    def test_wrong_values(self, make, options, message):
+        with pytest.raises(ValueError, match=message):
+            make(small_env(2), NETWORKS["compact"], **options)
+
+
+def test_short_options_and_short_episodes_are_trained():
+    """One to three options an episode, slices of eight: most of the meta-controller's sequences are padding."""
+    torch.manual_seed(0)
+    env = small_env(8)
+    algorithm = build("v2", env, settings=tiny_settings(slice_len=8, batch_size=16))
+    meta = algorithm.learners["meta"]
+    for batch in collect(algorithm, env, 20, batches=2):
+        meta.store(batch)
+    sample = meta.sample()
+    real = sample["collector", "mask"]
+    assert real.sum(-1).max() <= 4
+    starts = sample["is_init"][:, 0, 0]
+    result = meta.loss(sample)
+    assert result["loss"] > 0
+    assert result["trained_steps"] >= real[starts].sum() > 0
+
+
+def test_two_algorithms_share_nothing():
+    first, second = (build("v2", small_env(2)) for _ in range(2))
+    ids = [{id(t) for t in [*a.policy.parameters(), *a.policy.buffers()]} for a in (first, second)]
+    assert not ids[0] & ids[1]
+    assert first.learners["sub"].buffer is not second.learners["sub"].buffer
+
+
+def test_a_collector_carries_options_and_states_from_batch_to_batch():
+    torch.manual_seed(0)
+    env = small_env(4)
+    collector = make_collector(build("v2", env), env, 3)
+    first, second = (batch.clone() for batch, _ in zip(collector, range(2), strict=False))
+    collector.shutdown()
+    going_on = ~first["next", "done"][:, -1].squeeze(-1)
+    assert going_on.any()
+    for key in ("sub_hidden", "meta_hidden", "option_return", "option_steps", "active_subgoal", "option_init"):
+        assert (second[key][:, 0] == first["next", key][:, -1])[going_on].all(), key

@@ -1,0 +1,226 @@
+import pytest
+import torch
+from helpers import build, collect, parameter_distance, small_env, tiny_settings
+from tensordict import TensorDict
+
+from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
+
+
+def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, **settings):
+    torch.manual_seed(0)
+    network = QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=2, hidden_size=6)
+    controller = SubController(network, subgoal_key=None, init_key="is_init")
+    keep = extract or (lambda batch: batch)
+    return Learner(
+        controller,
+        tiny_settings(**settings),
+        extract=keep,
+        loss_keys={},
+        num_envs=num_envs,
+        samples_per_draw=samples_per_draw,
+    )
+
+
+def make_batch(num_envs=2, time=8):
+    """Episodes of four steps."""
+    shape = (num_envs, time)
+    td = TensorDict(observation=torch.randn(*shape, 3), action=torch.randint(2, shape), batch_size=shape)
+    td["is_init"] = (torch.arange(time) % 4 == 0).expand(shape).unsqueeze(-1).clone()
+    td["collector", "traj_ids"] = torch.arange(time // 4).repeat_interleave(4) + 100 * torch.arange(num_envs)[:, None]
+    done = (torch.arange(time) % 4 == 3).expand(shape).unsqueeze(-1).clone()
+    td["next"] = TensorDict(observation=torch.randn(*shape, 3), reward=torch.randn(*shape, 1), batch_size=shape)
+    td["next"].update({"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)})
+    return td
+
+
+class TestUpdatesDue:
+    @pytest.mark.parametrize(
+        ("warmup", "frames_per_update", "batches", "due"),
+        [
+            (0, 16, 1, 1),  # a batch has 16 frames
+            (0, 8, 1, 2),
+            (0, 0.5, 1, 32),
+            (0, 17, 1, 0),
+            (0, 24, 3, 2),
+            (16, 4, 1, 0),
+            (15, 1, 1, 1),
+            (17, 1, 1, 0),
+            (20, 4, 2, 3),
+            (1_000, 1, 2, 0),
+        ],
+    )
+    def test_frames_after_warmup_over_the_ratio(self, warmup, frames_per_update, batches, due):
+        learner = make_learner(warmup_frames=warmup, frames_per_update=frames_per_update)
+        for _ in range(batches):
+            learner.store(make_batch())
+        assert learner.updates_due() == due
+
+    def test_updates_made_are_no_longer_due_and_fractions_add_up(self):
+        learner, made = make_learner(frames_per_update=24), []
+        for _ in range(6):
+            learner.store(make_batch())
+            made.append(learner.updates_due())
+            for _ in range(made[-1]):
+                learner.update(learner.sample())
+        assert made == [0, 1, 1, 0, 1, 1] and learner.updates == 4 and learner.frames == 96
+
+    def test_nothing_is_due_while_nothing_is_stored(self):
+        learner = make_learner(extract=lambda batch: None)
+        learner.store(make_batch())
+        assert learner.frames == 16 and learner.updates_due() == 0
+
+
+class TestUpdate:
+    def test_it_reduces_the_loss_on_a_fixed_sample(self):
+        learner = make_learner(learning_rate=1e-2, tau=1e-6)
+        learner.store(make_batch())
+        sample = learner.sample()
+        losses = [learner.update(sample.clone())["loss"].item() for _ in range(60)]
+        assert losses[-1] < 0.3 * losses[0] and learner.updates == 60
+
+    def test_it_moves_the_acting_network_and_the_target_follows_at_the_rate_tau(self):
+        learner = make_learner(tau=0.25)
+        learner.store(make_batch())
+        before = learner.loss.value_network_params.data.clone()
+        assert parameter_distance(before, learner.loss.target_value_network_params) == 0
+        metrics = learner.update(learner.sample())
+        after, target = learner.loss.value_network_params.data, learner.loss.target_value_network_params.data
+        assert parameter_distance(before, after) > 0
+        assert parameter_distance(before * 0.75 + after * 0.25, target) < 1e-6
+        assert not any(value.requires_grad for value in metrics.values())
+        assert set(metrics) == {"loss", "td_error", "q_value", "target", "trained_steps"}
+
+    def test_a_second_update_adds_no_old_gradient(self):
+        learners = [make_learner(learning_rate=1e-2) for _ in range(2)]
+        torch.manual_seed(1)
+        first, second = make_batch(), make_batch()
+        for learner in learners:
+            learner.update(first)
+        learners[1].optimizer.zero_grad()
+        for learner in learners:
+            learner.update(second)
+        params = [learner.loss.value_network_params.data for learner in learners]
+        assert parameter_distance(*params) == 0
+
+    def test_gradients_are_clipped_to_the_norm(self):
+        norms = []
+        for max_grad_norm in (1e-3, 1e3):
+            learner = make_learner(max_grad_norm=max_grad_norm)
+            torch.manual_seed(1)
+            metrics = learner.update(make_batch())
+            gradients = [p.grad.flatten() for p in learner.network.parameters()]
+            norms.append((metrics["grad_norm"].item(), torch.cat(gradients).norm().item()))
+        (before, clipped), (same, whole) = norms
+        assert (
+            before == pytest.approx(same) and clipped == pytest.approx(1e-3, rel=1e-2) and whole == pytest.approx(same)
+        )
+
+    def test_only_its_own_level_moves(self):
+        env = small_env(4)
+        algorithm = build("v2", env)
+        sub, meta = algorithm.learners["sub"], algorithm.learners["meta"]
+        batch = collect(algorithm, env, 20)[0]
+        before = meta.loss.value_network_params.data.clone()
+        sub.store(batch)
+        sub.update(sub.sample())
+        assert parameter_distance(before, meta.loss.value_network_params.data) == 0
+
+
+class TestSample:
+    def test_one_draw_gives_several_minibatches_and_a_new_batch_discards_them(self):
+        learner = make_learner(samples_per_draw=3, batch_size=5, slice_len=4)
+        learner.store(make_batch())
+        draws = count_draws(learner)
+        for _ in range(3):
+            assert learner.sample().shape == (5, 4)
+        assert len(draws) == 1
+        learner.sample()
+        assert len(draws) == 2
+        learner.store(make_batch())
+        learner.sample()
+        assert len(draws) == 3
+
+    def test_minibatches_of_one_draw_differ(self):
+        learner = make_learner(samples_per_draw=2, batch_size=16)
+        learner.store(make_batch())
+        first, second = learner.sample(), learner.sample()
+        assert (first["observation"] != second["observation"]).any()
+
+    @pytest.mark.parametrize("slice_len", [1, 4])
+    def test_it_has_the_shape_of_the_settings(self, slice_len):
+        learner = make_learner(slice_len=slice_len, batch_size=7)
+        learner.store(make_batch())
+        assert learner.sample().shape == (7, slice_len)
+
+
+def count_draws(learner):
+    draws, sample = [], learner.buffer.sample
+    learner.buffer.sample = lambda *args: draws.append(1) or sample(*args)
+    return draws
+
+
+class TestSettings:
+    @pytest.mark.parametrize(
+        ("name", "value", "rule"),
+        [
+            ("slice_len", 0, ">= 1"),
+            ("batch_size", 0, ">= 1"),
+            ("capacity", 3, ">= slice_len"),
+            ("frames_per_update", 0.0, "> 0"),
+            ("warmup_frames", -1, ">= 0"),
+            ("learning_rate", 0.0, "> 0"),
+            ("tau", 0.0, r"in \(0, 1\]"),
+            ("tau", 1.5, r"in \(0, 1\]"),
+            ("max_grad_norm", 0.0, "> 0 or None"),
+        ],
+    )
+    def test_wrong_values_are_refused_when_set(self, name, value, rule):
+        with pytest.raises(ValueError, match=f"{name} must be {rule}, got {value}; "):
+            tiny_settings(**{name: value})
+
+    @pytest.mark.parametrize(
+        ("name", "value", "message"),
+        [
+            ("burn_in", 1.0, r"burn_in must lie in \[0, 1\), got 1.0; "),
+            ("loss_function", "l1", "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
+            ("sampling", "rows", "sampling must be 'steps' or 'episodes', got 'rows'; "),
+        ],
+    )
+    def test_wrong_values_that_concern_its_parts(self, name, value, message):
+        with pytest.raises(ValueError, match=message):
+            make_learner(**{name: value})
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"burn_in": 0.0},
+            {"train_exact_states": False},
+            {"loss_function": "smooth_l1"},
+            {"double": False},
+            {"learning_rate": 0.1},
+            {"max_grad_norm": 1e-3},
+            {"tau": 0.5},
+        ],
+        ids=str,
+    )
+    def test_each_setting_changes_what_is_learned(self, changes):
+        """Four updates on the same data end in other parameters."""
+        usual = {"learning_rate": 0.05, "batch_size": 8}
+        default, changed = make_learner(**usual), make_learner(**(usual | changes))
+        torch.manual_seed(1)
+        samples = [make_batch(num_envs=8) for _ in range(4)]
+        for sample in samples:
+            sample["is_init"][:2] = False
+            default.update(sample.clone())
+            changed.update(sample.clone())
+        params = [learner.loss.value_network_params.data for learner in (default, changed)]
+        assert parameter_distance(*params) > 1e-7
+
+    def test_sampling_reaches_the_memory(self):
+        samplers = {type(make_learner(sampling=kind).buffer.sampler) for kind in ("steps", "episodes")}
+        assert len(samplers) == 2
+
+    def test_settings_are_frozen(self):
+        with pytest.raises(AttributeError):
+            LearnerSettings().slice_len = 3
