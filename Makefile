@@ -1,5 +1,5 @@
 # `make train` and `make test` set everything up by themselves in .venv.
-PYTHON ?= python3.11
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 ARGS ?=
 

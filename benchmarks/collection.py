@@ -15,6 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from timing import compare
 from torch import Tensor
+from torchrl import torchrl_logger
 from torchrl.collectors import Collector
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
@@ -55,6 +56,7 @@ class RawLoop:
         return self.storage
 
     def record(self, step: int, entries: dict[str, Tensor]) -> None:
+        """Writes one step of all worlds into the storage, which the first step allocates."""
         if not self.storage:
             self.storage = {
                 name: value.new_empty((self.num_envs, self.steps, *value.shape[1:])) for name, value in entries.items()
@@ -202,7 +204,7 @@ def check_equal(algorithm: Algorithm, env: MultiGoalGridEnv, transformed: Transf
     }
     same |= {"subgoal": after["active_subgoal"], "next_observation": after["observation"]}
     same |= {f"next_{name}": after[name] for name in ("subgoal_mask", "sub_hidden")}
-    same |= {name: after[name] for name in raw if name in after.keys() and name not in same}
+    same |= {name: after[name] for name in raw if name in after and name not in same}
     for name, value in same.items():
         torch.testing.assert_close(
             value.view_as(raw[name]), raw[name], atol=1e-5, rtol=1e-5, msg=lambda m, n=name: f"{n}: {m}"
@@ -221,6 +223,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=0.7, help="length of a block")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    torchrl_logger.setLevel("WARNING")  # it writes to standard output
     check_equal(*make(arguments.network, arguments.envs, arguments.epsilon))
 
     algorithm, env, transformed = make(arguments.network, arguments.envs, arguments.epsilon)

@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDictBase
 from timing import compare
 from torch import Tensor, nn
+from torchrl import torchrl_logger
 from torchrl.collectors import Collector
 
 from hdrqn_torchrl.algorithms import Algorithm, make_hdrqn
@@ -25,7 +26,6 @@ from hdrqn_torchrl.modules import QNetwork, compact_network, paper_network
 
 Batch = dict[str, Tensor]
 GAMMA, TAU, LEARNING_RATE, MAX_GRAD_NORM = 0.99, 1e-3, 1e-3, 10.0
-LAYERS = {"features": "features", "gate": "gate", "memory": "lstm", "head": "streams"}  # of QNetwork: of RawQNetwork
 
 
 class RawQNetwork(nn.Module):
@@ -33,11 +33,12 @@ class RawQNetwork(nn.Module):
 
     def __init__(self, network: QNetwork) -> None:
         super().__init__()
-        self.features, self.gate = deepcopy(network.features), deepcopy(network.gate)
-        self.lstm, self.streams = deepcopy(network.memory), deepcopy(network.head.streams)
+        layers = network.features, network.memory, network.gate, network.head.streams
+        self.features, self.lstm, self.gate, self.streams = (deepcopy(layer) for layer in layers)
         self.hidden_size, self.one_hot = network.hidden_size, torch.eye(network.num_conditions)
 
     def forward(self, observation: Tensor, subgoal: Tensor | None, init: Tensor | None) -> Tensor:
+        """Q-values ``[B, T, A]``; the state restarts where ``init`` ``[B, T]`` is set."""
         features = self.features(observation)
         if subgoal is not None:
             if self.gate is not None:
@@ -49,7 +50,8 @@ class RawQNetwork(nn.Module):
         return value + advantage - advantage.mean(-1, keepdim=True)
 
     def restarting(self, features: Tensor, init: Tensor) -> Tensor:
-        weights = [parameter for _, parameter in self.lstm.named_parameters()]
+        """LSTM outputs, one cell call per step."""
+        weights = list(self.lstm.parameters())
         keep = (~init).float().unsqueeze(-1)
         hidden = cell = features.new_zeros(len(features), self.hidden_size)
         outputs = []
@@ -69,6 +71,7 @@ class RawReplay:
         self.last = (lengths.cumsum(0) - 1).repeat_interleave(lengths)  # last row of each row's episode
 
     def sample(self) -> Batch:
+        """Sequences ``[B, T]``; past the end of an episode its last row is repeated, and ``valid`` is false."""
         start = torch.randint(len(self.last), (self.batch_size, 1))
         index, last = start + self.offsets, self.last[start]
         valid = index <= last
@@ -86,6 +89,7 @@ class RawLearner:
         self.optimizer = torch.optim.Adam(self.parameters, lr=LEARNING_RATE, fused=True)
 
     def loss(self, batch: Batch) -> Tensor:
+        """Mean squared TD error over the trained steps."""
         valid, init = batch["valid"], batch["init"] & batch["valid"]
         stream = self.stream(batch, "observation")
         subgoal = self.stream(batch, "condition") if "condition" in batch else None
@@ -103,7 +107,7 @@ class RawLearner:
             discount = GAMMA ** batch["steps"] if "steps" in batch else GAMMA
             wanted = batch["reward"] + (discount * next_value).masked_fill(batch["terminated"], 0.0)
             time = torch.arange(valid.shape[1])
-            trained = (time >= valid.sum(1, keepdim=True) // 2) | (init.cumsum(1) > 0)
+            trained = (time >= len(time) // 2) | (init.cumsum(1) > 0)
             followed = torch.cat([valid[:, 1:], torch.zeros_like(valid[:, :1])], 1)
             trained &= valid & ~(batch["done"] & ~batch["terminated"] & followed)
         return (chosen - wanted).square().mul(trained).sum() / trained.sum().clamp(min=1)
@@ -115,6 +119,7 @@ class RawLearner:
         return torch.cat([now, following[:, -1:]], 1)
 
     def update(self) -> Tensor:
+        """One gradient step and one target update."""
         loss = self.loss(self.replay.sample())
         self.optimizer.zero_grad()
         loss.backward()
@@ -175,11 +180,9 @@ def check_equal(learner: Learner, raw: RawLearner, level: str, version: str) -> 
         batch["valid"] = sample["collector", "mask"]
         ours, reference = learner.loss(sample)["loss"], raw.loss(batch)
         torch.testing.assert_close(ours, reference, atol=1e-5, rtol=1e-5)
-        network = learner.network.network
-        layers = [(getattr(network, name), getattr(raw.online, twin)) for name, twin in LAYERS.items()]
-        pairs = [pair for mine, other in layers if mine for pair in zip(mine.parameters(), other.parameters())]
-        gradients = (torch.autograd.grad(value, list(side)) for value, side in zip((ours, reference), zip(*pairs)))
-        torch.testing.assert_close(*gradients, atol=1e-5, rtol=1e-3)
+        gradients = torch.autograd.grad(ours, list(learner.network.network.parameters()))
+        expected = torch.autograd.grad(reference, raw.parameters)
+        torch.testing.assert_close(gradients, expected, atol=1e-5, rtol=1e-3)
 
 
 def filled(version: str, network: str, batches: int) -> Algorithm:
@@ -219,6 +222,7 @@ def main() -> None:
     parser.add_argument("--batches", type=int, default=20, help="collected batches of 512 frames in the replay memory")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    torchrl_logger.setLevel("WARNING")  # it writes to standard output
     result: dict[str, object] = {"network": arguments.network}
     for version, level in (("v2", "sub"), ("v2", "meta"), ("v1", "meta")):
         learner = filled(version, arguments.network, arguments.batches).learners[level]

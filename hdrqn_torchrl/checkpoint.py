@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
 
@@ -23,11 +24,17 @@ def load_weights(module: nn.Module, path: Path) -> None:
     """Reads what :func:`save_weights` wrote into ``module``.
 
     Raises:
-        ValueError: if the file does not fit the module.
+        ValueError: if there is no such file, it is of another kind, or it does not fit the module.
     """
     if not path.is_file():
         raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
     try:
-        module.load_state_dict(load_file(path))
+        weights = load_file(path)
+    except SafetensorError as error:
+        raise ValueError(
+            f"{path} must be a safetensors file, got something else ({error}); see checkpoints/."
+        ) from error
+    try:
+        module.load_state_dict(weights)
     except RuntimeError as error:
         raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error

@@ -52,13 +52,14 @@ def plot_run(
                 axis.annotate(player, (0.02, result[f"{name}_mean"]), xycoords=("axes fraction", "data"), fontsize=8)
         axis.set(xlabel="environment frames", title=label)
         axis.grid(alpha=0.3)
-    axes[0].legend(loc="lower right")
+    if axes[0].get_legend_handles_labels()[0]:
+        axes[0].legend(loc="lower right")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
 def _curve(axis: Axes, metrics: dict[str, list[float]], column: str, label: str, style: dict) -> None:
-    points = [(x, y) for x, y in zip(metrics["frames"], metrics.get(column, []), strict=False) if y == y]
+    points = [(x, y) for x, y in zip(metrics.get("frames", []), metrics.get(column, []), strict=False) if y == y]
     if points:
         axis.plot(*zip(*points, strict=True), label=label, **style)

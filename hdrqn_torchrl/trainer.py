@@ -71,8 +71,8 @@ class Trainer:
 
     def train(self) -> None:
         """Runs to ``total_frames``. Weights are kept when it is interrupted, too."""
-        self.log(evaluation=True)
         try:
+            self.log(evaluation=True)
             for batch in self.collector:
                 self.step(batch)
                 if self.frames >= self.total_frames:
@@ -95,8 +95,9 @@ class Trainer:
             exploration.step(batch.numel())
         self.collector.update_policy_weights_()
         done = self.frames >= self.total_frames
-        if done or crossed(before, self.frames, self.log_frames):
-            self.log(evaluation=done or crossed(before, self.frames, self.evaluation_frames))
+        evaluation = done or crossed(before, self.frames, self.evaluation_frames)
+        if evaluation or crossed(before, self.frames, self.log_frames):
+            self.log(evaluation=evaluation)
 
     def log(self, *, evaluation: bool) -> None:
         """Writes one log point, after a greedy evaluation if asked for."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.envs.cells import FIRST_GOAL, OBSTACLE
+from hdrqn_torchrl.envs.cells import FIRST_GOAL, FLOOR, OBSTACLE, WALL
 from hdrqn_torchrl.envs.grid_rules import ACTIONS, GridRules
 from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
 
@@ -73,16 +73,17 @@ class PerfectMemorySearch:
     """
 
     def __init__(self, env: MultiGoalGridEnv) -> None:
-        rules, self.env = env.rules, env
-        cells = rules.nowhere
-        self._visible = torch.zeros((cells, cells + 1), device=env.device).scatter_(1, rules.window_cells, 1.0)[:, :-1]
-        self._adjacent = torch.zeros((cells, cells), device=env.device).scatter_(1, rules.moves, 1 / len(ACTIONS))
+        rules, worlds, device = env.rules, env.num_envs, env.device
+        self.env, cells = env, rules.nowhere
+        self._visible = torch.zeros((cells, cells + 1), device=device).scatter_(1, rules.window_cells, 1.0)[:, :-1]
+        self._adjacent = torch.zeros((cells, cells), device=device).scatter_(1, rules.moves, 1 / len(ACTIONS))
         self._adjacent.fill_diagonal_(0.0)  # a move that a wall stops leads to no neighbour
-        walls = torch.cat([rules.is_wall, rules.is_wall.new_ones(1)])
-        self._codes = walls.to(torch.uint8).repeat(env.num_envs, 1)  # what is where, as far as known
-        self._unseen = (~walls).float().repeat(env.num_envs, 1)
-        self._collected = torch.zeros((env.num_envs, rules.num_goals), dtype=torch.bool, device=env.device)
-        self._in_order = torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+        self._walls = torch.cat([rules.is_wall, rules.is_wall.new_ones(1)])  # windows show `nowhere` outside the map
+        self._codes = torch.empty((worlds, cells + 1), dtype=torch.uint8, device=device)  # what is where, if known
+        self._unseen = torch.empty((worlds, cells + 1), device=device)
+        self._collected = torch.empty((worlds, rules.num_goals), dtype=torch.bool, device=device)
+        self._in_order = torch.empty(worlds, dtype=torch.bool, device=device)
+        self._forget(torch.ones_like(self._in_order))
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Reads ``observation`` and ``attained``; writes ``action`` ``[N]`` int64."""
@@ -96,19 +97,18 @@ class PerfectMemorySearch:
         actions = _plan(rules, agent, codes, self._collected, self._in_order, worth_seeing)
         return tensordict.set(keys.ACTION, actions)
 
-    def _forget(self, fresh: Tensor) -> None:
-        is_free = ~torch.cat([self.env.rules.is_wall, self.env.rules.is_wall.new_ones(1)])
-        self._codes[fresh] = (~is_free).to(torch.uint8)
-        self._unseen[fresh] = is_free.float()
-        self._collected[fresh], self._in_order[fresh] = False, True
+    def _forget(self, worlds: Tensor) -> None:
+        self._codes[worlds] = torch.where(self._walls, WALL, FLOOR).to(torch.uint8)
+        self._unseen[worlds] = (~self._walls).float()
+        self._collected[worlds], self._in_order[worlds] = False, True
 
     def _remember(self, agent: Tensor, observation: Tensor, attained: Tensor) -> None:
         window = self.env.rules.window_cells[agent]
         self._codes.scatter_(1, window, observation.flatten(1))
         self._unseen.scatter_(1, window, 0.0)
         self._collected |= attained
-        first_ones = self._collected.cumprod(-1).sum(-1)
-        self._in_order &= first_ones == self._collected.sum(-1)
+        prefix = self._collected.cumprod(-1).sum(-1)  # goals 0, 1, ... without a gap
+        self._in_order &= prefix == self._collected.sum(-1)
 
 
 class UniformRandom:
@@ -125,9 +125,7 @@ class UniformRandom:
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes ``action`` ``[N]`` int64; reads nothing."""
         shape, device = (self.env.num_envs,), self.env.device
-        return tensordict.set(
-            keys.ACTION, torch.randint(len(ACTIONS), shape, generator=self._generator, device=device)
-        )
+        return tensordict.set(keys.ACTION, torch.randint(len(ACTIONS), shape, generator=self._generator, device=device))
 
 
 def _plan(
@@ -207,7 +205,7 @@ def play_episodes(env: MultiGoalGridEnv, player: Player) -> dict[str, float]:
         ``return_mean``, ``success_rate`` (share of episodes with all goals reached in order), ``steps_mean`` and
         ``episodes``.
     """
-    returns = torch.zeros(env.num_envs, device=env.device)
+    returns = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
     steps, success = torch.zeros_like(returns), torch.zeros_like(returns)
     playing = torch.ones_like(returns)
     tensordict = env.reset()

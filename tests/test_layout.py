@@ -1,0 +1,45 @@
+"""The order of the package's parts: imports inside it go downwards only."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import hdrqn_torchrl
+
+ORDER = (
+    "keys", "envs", "transforms", "modules", "objectives", "data", "learner", "algorithms", "evaluation", "checkpoint",
+    "logging", "plotting", "trainer", "run_folder",
+)  # fmt: skip
+ROOT = Path(hdrqn_torchrl.__file__).parent
+FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
+
+
+def imports_of(path):
+    """Full names of all modules that a file imports, wherever in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def part_of(path):
+    return path.relative_to(ROOT).with_suffix("").parts[0]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_a_file_imports_only_from_its_own_part_and_those_before(path):
+    rank = ORDER.index(part_of(path))
+    used = {name.split(".")[1] for name in imports_of(path) if name.startswith("hdrqn_torchrl.")}
+    assert {part for part in used if ORDER.index(part) > rank} == set()
+
+
+@pytest.mark.parametrize("path", [ROOT / "__init__.py", *FILES], ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_file_imports_hydra(path):
+    assert not {name.split(".")[0] for name in imports_of(path)} & {"hydra", "omegaconf"}
+
+
+def test_every_part_has_its_place():
+    assert {part_of(path) for path in FILES} == set(ORDER)
