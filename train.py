@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -119,10 +119,9 @@ def build(config: DictConfig, folder: Path) -> tuple[Trainer, EnvBase, dict]:
     from hydra.utils import instantiate
     from torchrl.collectors import Collector
 
-    from hdrqn_torchrl.envs.scripted import references_for
     from hdrqn_torchrl.evaluation import evaluate
     from hdrqn_torchrl.logging import RunLogger
-    from hdrqn_torchrl.run_folder import ceiling_of
+    from hdrqn_torchrl.run_folder import ceiling_of, references_for
     from hdrqn_torchrl.trainer import Trainer
 
     device = pick_device(config.device, torch.cuda.is_available())
@@ -161,7 +160,10 @@ def build(config: DictConfig, folder: Path) -> tuple[Trainer, EnvBase, dict]:
 
 
 def check(config: DictConfig) -> None:
-    """Refuses numbers that would fail only in the middle of a run."""
+    """Refuses keys that nothing reads and numbers that would fail only in the middle of a run."""
+    for section, schema in ((config, Schema), (config.evaluation, EvaluationSchema)):
+        if unknown := set(section) - {known.name for known in fields(schema)}:  # added with +
+            raise ValueError(f"{min(unknown)} must be a known setting; `python train.py --cfg job` shows all of them.")
     for key, least in (
         ("total_frames", 1),
         ("threads", 1),

@@ -2,8 +2,8 @@
 
 ``SubgoalTransform``, the controllers and ``Learner`` know nothing of this project's own tasks. Here the task is a
 stock Gymnasium environment: the agent sees the 7x7 cells in front of it and is paid for reaching the green square.
-Subgoals are the four gaps between the rooms and the square itself; a critic of one line says which one the agent
-stands on. Everything else (``GymWrapper``, ``SerialEnv``, ``Collector``) is TorchRL's.
+Subgoals are "go through a gap" and "reach the square"; a critic of three lines says when that has happened.
+Everything else (``GymWrapper``, ``SerialEnv``, ``Collector``) is TorchRL's.
 
 Run ``pip install minigrid``, then ``python examples/reuse_transform.py [--frames 40000]``.
 """
@@ -26,8 +26,15 @@ from torchrl.envs import Compose, GymWrapper, InitTracker, SerialEnv, Transforme
 
 from hdrqn_torchrl.data import OptionExtractor, StepSelector
 from hdrqn_torchrl.learner import Learner, LearnerSettings
-from hdrqn_torchrl.modules import CellFeatures, EpsilonGreedy, FullyConnectedFeatures, QNetwork
-from hdrqn_torchrl.modules import HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.modules import (
+    CellFeatures,
+    EpsilonGreedy,
+    FullyConnectedFeatures,
+    HierarchicalPolicy,
+    MetaController,
+    QNetwork,
+    SubController,
+)
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 try:
@@ -35,7 +42,7 @@ try:
 except ImportError as error:
     raise SystemExit("This example needs MiniGrid; install it with `pip install minigrid`.") from error
 
-SUBGOALS = ("west gap", "north gap", "south gap", "east gap", "goal")
+SUBGOALS = ("gap", "goal")
 NUM_ENVS, NUM_CODES, MIDDLE, HIDDEN = 16, 15, 9, 64
 
 
@@ -47,25 +54,31 @@ class FourRooms(gymnasium.ObservationWrapper):
         self.action_space = Discrete(3)  # turn left, turn right, forward; the others do nothing here
         cells = partial(Box, 0, self.unwrapped.width - 1, dtype=np.int64)
         self.observation_space = Dict(
-            observation=Box(0, NUM_CODES - 1, (7, 7), np.uint8), position=cells((2,)), landmarks=cells((5, 2))
+            observation=Box(0, NUM_CODES - 1, (7, 7), np.uint8),
+            position=cells((2,)),
+            moved=Box(0, 1, (1,), np.bool_),
+            landmarks=cells((5, 2)),
         )
 
     def observation(self, observation: dict) -> dict:
         """Object codes of the view; 11 + direction stands where the agent is (bottom centre)."""
         view = observation["image"][..., 0].copy()
         view[3, 6] = 11 + observation["direction"]
+        position = np.array(self.unwrapped.agent_pos)
         if self.unwrapped.step_count == 0:  # a new map
             grid, side = self.unwrapped.grid, range(1, self.unwrapped.width - 1)
             objects = {(x, y): getattr(grid.get(x, y), "type", None) for x in side for y in side}
             gaps = [cell for cell, kind in objects.items() if MIDDLE in cell and kind != "wall"]
             goal = [cell for cell, kind in objects.items() if kind == "goal"]
-            self.landmarks = np.array(gaps + goal)
-        return {"observation": view, "position": np.array(self.unwrapped.agent_pos), "landmarks": self.landmarks}
+            self.landmarks, self.position = np.array(gaps + goal), position
+        moved, self.position = (position != self.position).any(keepdims=True), position
+        return {"observation": view, "position": position, "moved": moved, "landmarks": self.landmarks}
 
 
-def standing_on(after: TensorDictBase) -> Tensor:
-    """The critic: which subgoals the last step reached, ``[N, 5]`` bool."""
-    return (after["position"].unsqueeze(-2) == after["landmarks"]).all(-1)
+def critic(after: TensorDictBase) -> Tensor:
+    """Which subgoals the last step reached, ``[N, 2]`` bool: a gap or the goal was entered."""
+    entered = (after["position"].unsqueeze(-2) == after["landmarks"]).all(-1) & after["moved"]  # [N, 4 gaps + goal]
+    return torch.stack([entered[..., :4].any(-1), entered[..., 4]], -1)
 
 
 def make_agent(anneal_frames: int) -> tuple[HierarchicalPolicy, dict[str, Learner], list[EpsilonGreedy]]:
@@ -76,10 +89,10 @@ def make_agent(anneal_frames: int) -> tuple[HierarchicalPolicy, dict[str, Learne
     )
     meta_network = QNetwork(FullyConnectedFeatures(HIDDEN, (128,)), num_actions=len(SUBGOALS), hidden_size=HIDDEN)
     sub = SubController(sub_network, explorations[0])
-    meta = MetaController(meta_network, explorations[1], input_keys=["sub_hidden"])
+    meta = MetaController(meta_network, explorations[1], input_keys=["sub_hidden"], mask_key=None)
     ends = {"reward": "intrinsic_reward", "done": "option_done", "terminated": "option_terminated"}
-    choice = {"action": "subgoal", "reward": "option_return", "steps": "option_steps", "action_mask": "subgoal_mask"}
-    settings = partial(LearnerSettings, frames_per_update=16, warmup_frames=1000, tau=0.01, max_grad_norm=10.0)
+    choice = {"action": "subgoal", "reward": "option_return", "steps": "option_steps"}
+    settings = partial(LearnerSettings, frames_per_update=8, warmup_frames=1000, tau=0.01, max_grad_norm=10.0)
     learners = {
         "sub": Learner(
             sub,
@@ -93,7 +106,10 @@ def make_agent(anneal_frames: int) -> tuple[HierarchicalPolicy, dict[str, Learne
             num_envs=NUM_ENVS,
         ),
         "meta": Learner(
-            meta, settings(slice_len=4), extract=OptionExtractor(input_keys=["sub_hidden"]), loss_keys=choice
+            meta,
+            settings(slice_len=4),
+            extract=OptionExtractor(input_keys=["sub_hidden"], mask_key=None),
+            loss_keys=choice,
         ),
     }
     return HierarchicalPolicy(meta, sub), learners, explorations
@@ -111,7 +127,12 @@ def main() -> None:
     # SubController's actions are indices, so the specs must not be one-hot.
     env = SerialEnv(NUM_ENVS, lambda: GymWrapper(FourRooms(), categorical_action_encoding=True))
     subgoals = SubgoalTransform(
-        len(SUBGOALS), critic=standing_on, extrinsic_reward_key="reward", hazard_key=None, max_option_steps=25
+        len(SUBGOALS),
+        critic=critic,
+        repeatable=True,
+        extrinsic_reward_key="reward",
+        hazard_key=None,
+        max_option_steps=25,
     )
     # Without InitTracker and the primers the LSTMs would start every step from zero, silently.
     primers = [controller.make_tensordict_primer() for controller in (policy.sub_controller, policy.meta_controller)]

@@ -5,6 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from torchrl.envs import EnvBase
+
+from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.envs.ceilings import ceiling
 from hdrqn_torchrl.plotting import plot_run, read_metrics
 from hdrqn_torchrl.trainer import Trainer
 
@@ -20,7 +24,7 @@ def write_results(
         folder: run folder with its ``metrics.csv``.
         trainer: the trainer that ran.
         result: final greedy evaluation (:func:`~hdrqn_torchrl.evaluation.evaluate`).
-        references: scripted players' results by name; the best of ``"memory"`` is the ceiling.
+        references: scripted players' results by name (:func:`references_for`); ``"memory"`` is the ceiling.
         title: heading of the picture.
 
     Returns:
@@ -39,6 +43,13 @@ def write_results(
     partial.replace(folder / "summary.json")
     plot_run(read_metrics(folder / "metrics.csv"), folder / "curves.png", title=title, references=references)
     return summary
+
+
+def references_for(env: EnvBase) -> References:
+    """What the scripted players achieve on the task of ``env``, by name; empty for tasks that have none."""
+    if not isinstance(env, MultiGoalGridEnv):
+        return {}
+    return {player: ceiling(player, **env.task) for player in ("planner", "memory", "random")}
 
 
 def ceiling_of(references: References) -> float | None:

@@ -81,7 +81,10 @@ def unroll_by_steps(network, observation, condition=None, init=None):
             if init is not None and init[b, t]:
                 state = network.initial_state(1)
             subgoal = None if condition is None else condition[b : b + 1, t]
-            value, state = network.step(observation[b : b + 1, t], subgoal, state)
+            if network.recurrent:
+                value, state = network.step(observation[b : b + 1, t], subgoal, state)
+            else:
+                value = network.evaluate(observation[b : b + 1, t], subgoal)
             values.append(value[0])
         rows.append(torch.stack(values))
     return torch.stack(rows)

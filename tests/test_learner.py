@@ -201,6 +201,7 @@ class TestSettings:
             {"learning_rate": 0.1},
             {"max_grad_norm": 1e-3},
             {"tau": 0.5},
+            {"max_target": 0.1},
         ],
         ids=str,
     )

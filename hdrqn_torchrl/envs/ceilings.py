@@ -87,7 +87,12 @@ def ceiling(
 
 def standard_tasks() -> Iterator[Task]:
     """Every row of :data:`MEASURED`."""
-    for layout, num_goals, max_steps in (("open", 2, 50), ("open", 3, 50), ("four_rooms", 2, 50), ("four_rooms", 3, 100)):
+    for layout, num_goals, max_steps in (
+        ("open", 2, 50),
+        ("open", 3, 50),
+        ("four_rooms", 2, 50),
+        ("four_rooms", 3, 100),
+    ):
         yield Task("planner", layout, num_goals, max_steps, None)
         for view in (None, 5, 3):
             yield Task("memory", layout, num_goals, max_steps, view)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -78,6 +78,14 @@ class MultiGoalGridEnv(EnvBase):
             layout, num_goals=num_goals, view=view, obstacle=obstacle, num_obstacles=num_obstacles, device=device
         )
         self.num_envs, self.max_steps = num_envs, max_steps
+        self.task: dict[str, Any] = {
+            "layout": layout,
+            "num_goals": num_goals,
+            "view": view,
+            "max_steps": max_steps,
+            "obstacle": obstacle,
+            "num_obstacles": num_obstacles,
+        }
         self._make_specs()
         self._generator = torch.Generator(device)
         self.set_seed(torch.randint(2**31, ()).item() if seed is None else seed)

@@ -140,11 +140,10 @@ class RecurrentDQNLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         k, after = self.tensor_keys, tensordict["next"]
-        init = _steps_of(tensordict.get(k.init), tensordict)
+        init = _steps_of(tensordict[k.init], tensordict)
         mask = tensordict.get(k.mask, None)
         valid = torch.ones_like(init) if mask is None else _steps_of(mask, tensordict)
         init = init & valid
-        init = _steps_of(tensordict[k.init], tensordict) & valid
         done, terminated = _steps_of(after[k.done], tensordict), _steps_of(after[k.terminated], tensordict)
 
         inputs = self._inputs(tensordict, valid, init)

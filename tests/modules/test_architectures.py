@@ -4,7 +4,7 @@ from helpers import small_env
 from torch import nn
 from torchrl.data import Bounded
 
-from hdrqn_torchrl.modules import compact_network, paper_network
+from hdrqn_torchrl.modules import CellsToImage, compact_network, paper_network
 from hdrqn_torchrl.modules.architectures import is_grid
 
 IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
@@ -53,8 +53,9 @@ def test_the_papers_network_on_a_hidden_state():
 def test_the_papers_network_draws_cells_as_a_44x44_image():
     spec = small_env(4, view=5).observation_spec["observation"]
     network = paper_network().q_network(spec, num_actions=4)
-    image = network.features[0](torch.zeros(1, 5, 5, dtype=torch.uint8))
-    assert image.shape == (1, 3, 44, 44) and layers(network)[:4] == ["Conv2d"] * 4
+    drawing = next(module for module in network.modules() if isinstance(module, CellsToImage))
+    assert drawing(torch.zeros(1, 5, 5, dtype=torch.uint8)).shape == (1, 3, 44, 44)
+    assert layers(network) == ["Conv2d"] * 4 + ["Linear", "LSTM", "Linear"]
 
 
 def test_sizes_of_the_compact_network():
@@ -63,6 +64,14 @@ def test_sizes_of_the_compact_network():
     shapes = [tuple(layer.weight.shape) for layer in network.features.modules() if isinstance(layer, nn.Linear)]
     assert shapes == [(7, 3 * 3 * 5), (5, 7)]
     assert (network.memory.input_size, network.memory.hidden_size) == (5, 10)
+
+
+@pytest.mark.parametrize("make", [compact_network, paper_network])
+def test_gated_features(make):
+    spec = small_env(4).observation_spec["observation"]
+    for gated in (True, False):
+        network = make(8, gate_features=gated).q_network(spec, num_actions=4, num_conditions=2)
+        assert (network.gate is not None) == gated
 
 
 def test_each_network_has_weights_of_its_own():

@@ -88,8 +88,8 @@ def test_the_schedule_travels_in_the_state_dict():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"start": 1.5}, r"epsilon start must lie in \[0, 1\], got 1.5; "),
-        ({"end": -0.1}, r"epsilon end must lie in \[0, 1\], got -0.1; "),
+        ({"start": 1.5}, r"start must be an epsilon in \[0, 1\], got 1.5; "),
+        ({"end": -0.1}, r"end must be an epsilon in \[0, 1\], got -0.1; "),
         ({"anneal_frames": 0}, "anneal_frames must be >= 1, got 0; "),
     ],
 )

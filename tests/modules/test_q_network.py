@@ -22,8 +22,9 @@ def test_dueling_adds_the_centred_advantage_to_the_value():
 @pytest.mark.parametrize("recurrent", [True, False])
 @pytest.mark.parametrize("num_conditions", [0, 3])
 @pytest.mark.parametrize("restarts", [False, True])
-def test_unroll_equals_a_loop_over_steps(recurrent, num_conditions, restarts):
-    network = make_network(recurrent=recurrent, num_conditions=num_conditions)
+@pytest.mark.parametrize("gated", [False, True])
+def test_unroll_equals_a_loop_over_steps(recurrent, num_conditions, restarts, gated):
+    network = make_network(recurrent=recurrent, num_conditions=num_conditions, gate_features=gated)
     observation = torch.randn(3, 7, 5)
     condition = torch.randint(num_conditions, (3, 7)) if num_conditions else None
     init = (torch.rand(3, 7) < 0.3) if restarts else None
@@ -70,12 +71,40 @@ def test_one_decision_needs_no_batch():
         torch.testing.assert_close(single, several[0])
 
 
-def test_without_recurrence_the_state_passes_through_and_the_past_does_not_matter():
-    network, state = make_network(recurrent=False), (torch.ones(2, 6), torch.ones(2, 6))
-    value, after = network.step(torch.randn(2, 5), None, state)
-    assert value.shape == (2, 4) and after is state
-    observation = torch.randn(1, 4, 5)
+def test_without_recurrence_the_past_does_not_matter():
+    network, observation = make_network(recurrent=False), torch.randn(1, 4, 5)
     torch.testing.assert_close(network.unroll(observation)[:, 2:], network.unroll(observation[:, 2:]))
+
+
+class TestGatedFeatures:
+    def test_each_condition_scales_each_feature(self):
+        network = make_network(num_conditions=2, gate_features=True)
+        with torch.no_grad():
+            network.gate.weight.copy_(torch.stack([torch.ones(8), torch.arange(8.0)]))
+        observation, plain = torch.randn(3, 5), make_network(num_conditions=2)
+        plain.load_state_dict(network.state_dict(), strict=False)
+        state = network.initial_state(3)
+
+        def scaled(condition, factors):
+            inputs = torch.cat([network.features(observation) * factors, torch.eye(2)[condition]], -1)
+            return network.head(torch.lstm_cell(inputs, state, *network.memory.parameters())[0])
+
+        for condition, factors in (
+            (torch.tensor([0, 0, 0]), torch.ones(8)),
+            (torch.tensor([1, 1, 1]), torch.arange(8.0)),
+        ):
+            value, _ = network.step(observation, condition, state)
+            torch.testing.assert_close(value, scaled(condition, factors))
+        torch.testing.assert_close(
+            network.step(observation, torch.tensor([0, 0, 0]), state)[0],
+            plain.step(observation, torch.tensor([0, 0, 0]), state)[0],
+        )
+
+    def test_the_factors_are_learned_and_need_a_condition(self):
+        network = make_network(num_conditions=2, gate_features=True)
+        network.unroll(torch.randn(1, 2, 5), torch.tensor([[0, 0]])).sum().backward()
+        assert network.gate.weight.grad[0].any() and not network.gate.weight.grad[1].any()
+        assert make_network(gate_features=True).gate is None
 
 
 def test_the_initial_state_is_zero():

@@ -103,7 +103,7 @@ def make_sample(seed=0, *, padded=True):
     return sample
 
 
-def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, double=True, huber=False):
+def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, double=True, huber=False, limit=None):
     """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps."""
     keys = {"action": "action", "reward": "reward", "done": "done", "terminated": "terminated", "init": "is_init"}
     keys |= {"flat": {}, "sub": SUB_KEYS, "meta": META_KEYS}[level]
@@ -129,6 +129,7 @@ def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, d
             best = max((a for a in range(ACTIONS) if allowed[a]), key=lambda a: chooser[a])
             steps = after["option_steps"][b, t].item() if "steps" in keys else 1
             y = after[keys["reward"]][b, t, 0] + (0.0 if terminated else gamma**steps * target_q[t + 1, best])
+            y = y if limit is None else min(y, torch.tensor(limit))
             prediction = q[t, sample[keys["action"]][b, t]]
             total = total + (functional.smooth_l1_loss(prediction, y) if huber else (prediction - y) ** 2)
             count += 1
@@ -148,6 +149,7 @@ class TestAgainstPlainLoops:
             {"double": False},
             {"loss_function": "smooth_l1"},
             {"gamma": 1.0},
+            {"max_target": 0.2},
             {"recurrent": False},
         ],
         ids=str,
@@ -165,6 +167,7 @@ class TestAgainstPlainLoops:
             exact=settings.get("train_exact_states", True),
             double=settings.get("double", True),
             huber="loss_function" in settings,
+            limit=settings.get("max_target"),
         )
         assert result["trained_steps"].item() == count
         torch.testing.assert_close(result["loss"], wanted)

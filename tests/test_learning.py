@@ -1,0 +1,47 @@
+"""Agents that solve a small task within a minute."""
+
+import pytest
+import torch
+from helpers import build, make_collector, small_env, tiny_settings
+
+from hdrqn_torchrl.evaluation import evaluate
+from hdrqn_torchrl.modules import EpsilonGreedy, compact_network
+
+TASK = {"num_obstacles": 0, "max_steps": 16}  # both goals in a 3x3 room, seen through a 3x3 window
+
+
+def learned(name, total_frames, **options):
+    """Success of the greedy policy after training, and before it."""
+    torch.manual_seed(0)
+    env = small_env(32, **TASK)
+    settings = tiny_settings(
+        slice_len=8, batch_size=32, capacity=50_000, frames_per_update=20, warmup_frames=2_000, learning_rate=2e-3, tau=0.01
+    )
+    algorithm = build(name, env, compact_network(32, (64,)), settings=settings, **options)
+    evaluation_env = algorithm.transform(small_env(200, **TASK))
+    before = evaluate(evaluation_env, algorithm.policy, episodes=200)["success_rate"]
+    collector = make_collector(algorithm, env, 8, total_frames)
+    for batch in collector:
+        for learner in algorithm.learners.values():
+            learner.store(batch)
+            for _ in range(learner.updates_due()):
+                learner.update(learner.sample())
+        for exploration in algorithm.explorations.values():
+            exploration.step(batch.numel())
+    return evaluate(evaluation_env, algorithm.policy, episodes=200)["success_rate"], before
+
+
+def schedule():
+    return EpsilonGreedy(1.0, 0.1, anneal_frames=20_000)
+
+
+@pytest.mark.slow
+def test_v2_solves_a_small_room():
+    after, before = learned("v2", 60_000, sub_exploration=schedule(), meta_exploration=schedule())
+    assert before < 0.5 and after >= 0.9
+
+
+@pytest.mark.slow
+def test_drqn_solves_a_small_room():
+    after, before = learned("drqn", 60_000, exploration=schedule())
+    assert before < 0.5 and after >= 0.9
