@@ -86,8 +86,9 @@ def main() -> None:
 
     network, lstm = make_network()
     env, evaluation_env = make_env(lstm, NUM_ENVS), make_env(lstm, 10)
-    choose = QValueModule(action_value_key="q", action_space="categorical", spec=env.action_spec)
-    explore = EGreedyModule(env.action_spec, eps_init=1.0, eps_end=0.05, annealing_num_steps=updates * 16)
+    action = env.action_spec_unbatched  # one policy for both numbers of environments
+    choose = QValueModule(action_value_key="q", action_space="categorical", spec=action)
+    explore = EGreedyModule(action, eps_init=1.0, eps_end=0.05, annealing_num_steps=updates * 16)
     policy = TensorDictSequential(network, choose, explore)
 
     loss = RecurrentDQNLoss(network, gamma=0.99, burn_in=0.5)  # the network as it is: acting is none of its business

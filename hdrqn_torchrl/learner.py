@@ -125,6 +125,7 @@ class Learner:
         )
         self._drawn: list[TensorDictBase] = []
         self.updates, self.frames = 0, 0
+        self._warm_at = settings.warmup_frames  # or when the first transition came, if that is later
 
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
@@ -132,12 +133,14 @@ class Learner:
         self._drawn = []
         transitions = self.extract(batch)
         if transitions is not None:
+            if not len(self.buffer):
+                self._warm_at = max(self._warm_at, self.frames - batch.numel())
             self.buffer.extend(transitions)
 
     def updates_due(self) -> int:
         """How many updates are owed for the frames seen so far."""
-        owed = (self.frames - self.settings.warmup_frames) / self.settings.frames_per_update
-        return max(0, int(owed) - self.updates) if len(self.buffer) else 0
+        owed = int((self.frames - self._warm_at) / self.settings.frames_per_update)
+        return max(0, owed - self.updates) if len(self.buffer) else 0
 
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len]``."""

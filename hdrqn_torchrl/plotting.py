@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-from matplotlib import pyplot
+import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+Metrics = dict[str, list[float]]
+References = dict[str, dict[str, float]]
 
 _PANELS = (
     ("return", "total reward of an episode"),
@@ -19,7 +20,7 @@ _PANELS = (
 )
 
 
-def read_metrics(path: Path) -> dict[str, list[float]]:
+def read_metrics(path: Path) -> Metrics:
     """Columns of a ``metrics.csv``; an empty cell is NaN."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -28,11 +29,11 @@ def read_metrics(path: Path) -> dict[str, list[float]]:
 
 
 def plot_run(
-    metrics: dict[str, list[float]],
+    metrics: Metrics,
     path: Path,
     *,
     title: str = "",
-    references: dict[str, dict[str, float]] | None = None,
+    references: References | None = None,
 ) -> None:
     """Draws the paper's four curves (reward, intrinsic, extrinsic, steps) of one run over environment frames.
 
@@ -42,24 +43,58 @@ def plot_run(
         title: heading.
         references: scripted players by name, each with ``return_mean`` and ``steps_mean``, drawn as dashed lines.
     """
-    figure, axes = pyplot.subplots(1, len(_PANELS), figsize=(4 * len(_PANELS), 3.4), layout="constrained")
+    figure = Figure(figsize=(4 * len(_PANELS), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(_PANELS))
     for axis, (name, label) in zip(axes, _PANELS, strict=True):
         for source, style in (("behaviour", {"alpha": 0.5}), ("greedy", {"marker": ".", "linewidth": 2})):
             _curve(axis, metrics, f"{source}/{name}", source, style)
-        for player, result in (references or {}).items():
-            if f"{name}_mean" in result:
-                axis.axhline(result[f"{name}_mean"], linestyle="--", linewidth=1, color="grey")
-                axis.annotate(player, (0.02, result[f"{name}_mean"]), xycoords=("axes fraction", "data"), fontsize=8)
+        _reference_lines(axis, references or {}, f"{name}_mean")
         axis.set(xlabel="environment frames", title=label)
         axis.grid(alpha=0.3)
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="lower right")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
-    pyplot.close(figure)
 
 
-def _curve(axis: Axes, metrics: dict[str, list[float]], column: str, label: str, style: dict) -> None:
+def plot_comparison(
+    runs: dict[str, list[Metrics]], path: Path, *, title: str = "", references: References | None = None
+) -> None:
+    """Draws greedy return and success of several algorithms over environment frames: mean and range over their runs.
+
+    Args:
+        runs: metrics of the runs (one per seed) of each algorithm, by label. The runs of one label share their
+            evaluation frames; frames that only some of them have reached are left out.
+        path: picture to write; its ending chooses the format.
+        title: heading.
+        references: scripted players by name, with ``return_mean`` and ``success_rate``, drawn as dashed lines.
+    """
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    axes = figure.subplots(1, 2)
+    panels = (("greedy/return", "return_mean", "return"), ("greedy/success", "success_rate", "all goals in order"))
+    for axis, (column, reference, label) in zip(axes, panels, strict=True):
+        for name, seeds in runs.items():
+            points = [dict(zip(run["frames"], run[column], strict=True)) for run in seeds]
+            frames = [x for x in seeds[0]["frames"] if all(not np.isnan(run.get(x, np.nan)) for run in points)]
+            values = np.array([[run[x] for x in frames] for run in points])
+            axis.plot(frames, values.mean(0), marker=".", label=f"{name} ({len(seeds)} seeds)")
+            axis.fill_between(frames, values.min(0), values.max(0), alpha=0.2)
+        _reference_lines(axis, references or {}, reference)
+        axis.set(xlabel="environment frames", title=f"greedy evaluation: {label}")
+        axis.grid(alpha=0.3)
+    axes[1].legend(loc="lower right")
+    figure.suptitle(title)
+    figure.savefig(path, dpi=110)
+
+
+def _reference_lines(axis: Axes, references: References, name: str) -> None:
+    for player, result in references.items():
+        if name in result:
+            axis.axhline(result[name], linestyle="--", linewidth=1, color="grey")
+            axis.annotate(player, (0.02, result[name]), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
+
+
+def _curve(axis: Axes, metrics: Metrics, column: str, label: str, style: dict) -> None:
     points = [(x, y) for x, y in zip(metrics.get("frames", []), metrics.get(column, []), strict=False) if y == y]
     if points:
         axis.plot(*zip(*points, strict=True), label=label, **style)

@@ -7,7 +7,7 @@ from helpers import build, make_collector, small_env, tiny_settings
 from hdrqn_torchrl.evaluation import evaluate
 from hdrqn_torchrl.modules import EpsilonGreedy, compact_network
 
-TASK = {"num_obstacles": 0, "max_steps": 16}  # both goals in a 3x3 room, seen through a 3x3 window
+TASK = {"num_obstacles": 0, "max_steps": 16, "view": 3}
 
 
 def learned(name, total_frames, **options):
@@ -17,7 +17,7 @@ def learned(name, total_frames, **options):
     settings = tiny_settings(
         slice_len=8, batch_size=32, capacity=50_000, frames_per_update=20, warmup_frames=2_000, learning_rate=2e-3, tau=0.01
     )
-    algorithm = build(name, env, compact_network(32, (64,)), settings=settings, **options)
+    algorithm = build(name, env, compact_network(32, (64,)), settings=settings, gamma=0.9, **options)
     evaluation_env = algorithm.transform(small_env(200, **TASK))
     before = evaluate(evaluation_env, algorithm.policy, episodes=200)["success_rate"]
     collector = make_collector(algorithm, env, 8, total_frames)

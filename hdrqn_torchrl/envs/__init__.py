@@ -1,5 +1,21 @@
 """Environments, the scripted players that mark their ceilings, and their Gymnasium twins."""
 
+from hdrqn_torchrl.envs.ceilings import ceiling
 from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
+from hdrqn_torchrl.envs.scripted import (
+    FullInformationPlanner,
+    PerfectMemorySearch,
+    UniformRandom,
+    play_episodes,
+    scripted_ceiling,
+)
 
-__all__ = ["MultiGoalGridEnv"]
+__all__ = [
+    "FullInformationPlanner",
+    "MultiGoalGridEnv",
+    "PerfectMemorySearch",
+    "UniformRandom",
+    "ceiling",
+    "play_episodes",
+    "scripted_ceiling",
+]

@@ -1,6 +1,6 @@
 """What the scripted players achieve on the paper's tasks: the ceilings that learning curves are drawn against.
 
-``python -m hdrqn_torchrl.envs.ceilings`` measures the table anew.
+``python benchmarks/ceilings.py`` measures the table anew.
 """
 
 from __future__ import annotations
@@ -63,15 +63,10 @@ def ceiling(
         20000
     """
     if obstacle == "stay" and num_obstacles == 2 and isinstance(layout, str):
-        task = Task(player, layout, num_goals, max_steps, view if player == "memory" else None)
-        if task in MEASURED:
-            return_mean, success_rate, steps_mean = MEASURED[task]
-            return {
-                "return_mean": return_mean,
-                "success_rate": success_rate,
-                "steps_mean": steps_mean,
-                "episodes": MEASURED_EPISODES,
-            }
+        figures = MEASURED.get(Task(player, layout, num_goals, max_steps, view if player == "memory" else None))
+        if figures is not None:
+            names = ("return_mean", "success_rate", "steps_mean")
+            return dict(zip(names, figures, strict=True)) | {"episodes": MEASURED_EPISODES}
     return scripted_ceiling(
         player,
         layout=layout,
@@ -105,10 +100,3 @@ def measure(task: Task, episodes: int, seed: int = 0) -> dict[str, float]:
     return scripted_ceiling(
         player, layout=layout, num_goals=num_goals, max_steps=max_steps, view=view, episodes=episodes, seed=seed
     )
-
-
-if __name__ == "__main__":
-    for standard_task in standard_tasks():
-        result = measure(standard_task, MEASURED_EPISODES)
-        figures = "{return_mean:.3f}, {success_rate:.4f}, {steps_mean:.1f}".format(**result)
-        print(f"    Task{tuple(standard_task)}: ({figures}),")

@@ -8,7 +8,7 @@ from torch import Tensor
 from hdrqn_torchrl.envs.cells import AGENT_COLOUR, FIRST_GOAL, palette
 from hdrqn_torchrl.envs.grid_rules import GridRules, GridState
 
-_DIMMED = 0.45  # brightness of what the agent does not see
+_DIMMED = 0.65  # brightness of what the agent does not see
 
 
 def draw_worlds(rules: GridRules, state: GridState, *, cell_pixels: int = 32) -> Tensor:
@@ -35,16 +35,15 @@ def draw_worlds(rules: GridRules, state: GridState, *, cell_pixels: int = 32) ->
     if cell_pixels < 4:
         raise ValueError(f"cell_pixels must be >= 4, got {cell_pixels}; use 32 for a picture to look at.")
     codes = rules.whole_map(state).long()
-    worlds, device = len(codes), codes.device
+    device, world = codes.device, torch.arange(len(codes), device=codes.device)
     tiles = _tiles(rules.num_codes, cell_pixels).to(device)[codes]  # [N, height, width, pixels, pixels, 3]
-    brightness = torch.full((worlds, rules.nowhere + 1), _DIMMED, device=device)
+    brightness = torch.full((len(codes), rules.nowhere + 1), _DIMMED, device=device)
     brightness.scatter_(1, rules.window_cells[state.agent], 1.0)
     tiles = (tiles * brightness[:, :-1].view(codes.shape)[..., None, None, None]).to(torch.uint8)
     row, column = state.agent // rules.width, state.agent % rules.width
-    under_agent = tiles[torch.arange(worlds, device=device), row, column]
     disc = _disc(cell_pixels, 0.5, 0.5, 0.3).to(device)[..., None]
     agent_colour = torch.tensor(AGENT_COLOUR, dtype=torch.uint8, device=device)
-    tiles[torch.arange(worlds, device=device), row, column] = torch.where(disc, agent_colour, under_agent)
+    tiles[world, row, column] = torch.where(disc, agent_colour, tiles[world, row, column])
     return tiles.transpose(2, 3).flatten(3, 4).flatten(1, 2)
 
 
@@ -55,7 +54,7 @@ def _tiles(num_codes: int, pixels: int) -> Tensor:
     for code in range(FIRST_GOAL, num_codes):
         count = code - FIRST_GOAL + 1
         for dot in range(count):
-            tiles[code, _disc(pixels, 0.85, (dot + 1) / (count + 1), 0.08)] = 255
+            tiles[code, _disc(pixels, 0.5, (dot + 1) / (count + 1), 0.1)] = 255
     tiles[:, -1] = tiles[:, :, -1] = colours // 8 * 7  # a thin line between cells
     return tiles
 

@@ -104,14 +104,14 @@ class GridRules:
             )
         is_wall = torch.tensor([[cell == "#" for cell in row] for row in rows]).flatten()
         free = (~is_wall).nonzero().squeeze(-1)
-        needed = 1 + num_obstacles + num_goals
-        if len(free) < needed + (obstacle == "teleport"):
+        needed = 1 + num_obstacles + num_goals + (obstacle == "teleport")  # teleport: a cell to move to
+        if len(free) < needed:
             raise ValueError(
-                f"the map has {len(free)} free cells but the agent, {num_obstacles} obstacles and num_goals={num_goals} "
-                f"need {needed}; use a larger layout or fewer goals."
+                f"layout has {len(free)} free cells, but the agent, {num_obstacles} obstacles and {num_goals} goals "
+                f"need {needed}; use a larger layout, or a smaller num_obstacles or num_goals."
             )
         self.num_goals, self.num_obstacles, self.teleport = num_goals, num_obstacles, obstacle == "teleport"
-        self.view = view or 2 * max(self.height - 2, self.width - 2) + 1
+        self.view = view or 2 * self._span(free) + 3  # from any free cell all others and the walls around them
         self.num_codes = FIRST_GOAL + num_goals
         self.nowhere = self.height * self.width
         self.is_wall = is_wall.to(device)
@@ -123,6 +123,11 @@ class GridRules:
         codes = [OBSTACLE] * num_obstacles + [FIRST_GOAL + index for index in range(num_goals)]
         self._object_codes = torch.tensor(codes, dtype=torch.uint8, device=device)
         self._goal_bits = (2 ** torch.arange(num_goals)).to(device)
+
+    def _span(self, free: Tensor) -> int:
+        """Largest distance between two free cells along one axis."""
+        rows, columns = free // self.width, free % self.width
+        return int(max(rows.max() - rows.min(), columns.max() - columns.min()))
 
     def _move_table(self, is_wall: Tensor) -> Tensor:
         """Cell after each action from each cell, ``[cells, 4]``; a wall or the border stops the move."""
@@ -196,10 +201,8 @@ class GridRules:
         everything = torch.cat([agent.unsqueeze(-1), objects], -1).sort(-1).values
         shared = (everything[:, 1:] == everything[:, :-1]) & (everything[:, 1:] != self.nowhere)
         if shared.any():
-            raise ValueError(
-                f"agent and objects must stand on distinct cells, got cell {everything[:, 1:][shared].unique().tolist()} "
-                "more than once; move one of them."
-            )
+            twice = everything[:, 1:][shared].unique().tolist()
+            raise ValueError(f"agent and objects must stand on distinct cells, got {twice} twice; move one of them.")
         return GridState(agent, objects, torch.ones_like(agent, dtype=torch.bool))
 
     def step(

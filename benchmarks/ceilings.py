@@ -1,0 +1,12 @@
+"""Measures the scripted players on the paper's tasks and prints the rows of ``MEASURED`` in envs/ceilings.py."""
+
+import torch
+
+from hdrqn_torchrl.envs.ceilings import MEASURED_EPISODES, measure, standard_tasks
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    for task in standard_tasks():
+        result = measure(task, MEASURED_EPISODES)
+        figures = "{return_mean:.3f}, {success_rate:.4f}, {steps_mean:.1f}".format(**result)
+        print(f"    Task{tuple(task)}: ({figures}),".replace("'", '"'), flush=True)
