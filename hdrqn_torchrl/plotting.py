@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 Metrics = dict[str, list[float]]
 References = dict[str, dict[str, float]]
@@ -50,6 +51,7 @@ def plot_run(
             _curve(axis, metrics, f"{source}/{name}", source, style)
         _reference_lines(axis, references or {}, f"{name}_mean")
         axis.set(xlabel="environment frames", title=label)
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(alpha=0.3)
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="lower right")
@@ -81,6 +83,7 @@ def plot_comparison(
             axis.fill_between(frames, values.min(0), values.max(0), alpha=0.2)
         _reference_lines(axis, references or {}, reference)
         axis.set(xlabel="environment frames", title=f"greedy evaluation: {label}")
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.grid(alpha=0.3)
     axes[1].legend(loc="lower right")
     figure.suptitle(title)
@@ -88,10 +91,11 @@ def plot_comparison(
 
 
 def _reference_lines(axis: Axes, references: References, name: str) -> None:
-    for player, result in references.items():
+    for place, (player, result) in enumerate(references.items()):
         if name in result:
             axis.axhline(result[name], linestyle="--", linewidth=1, color="grey")
-            axis.annotate(player, (0.02, result[name]), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
+            at = (0.02 + 0.2 * place, result[name])  # side by side: two players may achieve the same
+            axis.annotate(player, at, xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
 
 
 def _curve(axis: Axes, metrics: Metrics, column: str, label: str, style: dict) -> None:

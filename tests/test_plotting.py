@@ -2,8 +2,9 @@ import math
 
 import pytest
 from matplotlib import pyplot
+from matplotlib.figure import Figure
 
-from hdrqn_torchrl.plotting import plot_run, read_metrics
+from hdrqn_torchrl.plotting import plot_comparison, plot_run, read_metrics
 
 METRICS = {
     "frames": [0.0, 100.0, 200.0],
@@ -17,11 +18,11 @@ REFERENCES = {"memory": {"return_mean": 2.0, "steps_mean": 16.5}, "random": {"re
 @pytest.fixture
 def figures(monkeypatch):
     """Figures as they are when they are saved."""
-    kept = []
-    monkeypatch.setattr(pyplot, "close", kept.append)
-    yield kept
-    monkeypatch.undo()
-    pyplot.close("all")
+    kept, save = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, *args, **kwargs: (kept.append(figure), save(figure, *args, **kwargs))
+    )
+    return kept
 
 
 def lines(axis):
@@ -46,7 +47,7 @@ def test_curves_skip_the_gaps_and_references_are_dashed(tmp_path, figures):
     assert figures[0].get_suptitle() == "a run"
 
 
-def test_the_picture_is_written_and_the_figure_closed(tmp_path):
+def test_the_picture_is_written_without_pyplots_global_state(tmp_path):
     plot_run(METRICS, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
     assert not pyplot.get_fignums()
@@ -57,3 +58,13 @@ def test_the_picture_is_written_and_the_figure_closed(tmp_path):
 def test_a_run_without_results_has_an_empty_picture(tmp_path, metrics):
     plot_run(metrics, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").exists()
+
+
+def test_a_comparison_draws_mean_and_range_where_all_seeds_were_evaluated(tmp_path, figures):
+    first = {"frames": [0.0, 10.0, 20.0], "greedy/return": [0.0, 1.0, math.nan], "greedy/success": [0.0, 0.5, math.nan]}
+    second = {"frames": [0.0, 10.0, 20.0], "greedy/return": [1.0, 2.0, 2.0], "greedy/success": [0.5, 1.0, 1.0]}
+    plot_comparison({"v2": [first, second]}, tmp_path / "comparison.png", references=REFERENCES)
+    returns, success = figures[0].axes
+    assert lines(returns) == {"v2 (2 seeds)": [[0.0, 0.5], [10.0, 1.5]]}
+    assert lines(success) == {"v2 (2 seeds)": [[0.0, 0.25], [10.0, 0.75]]}
+    assert returns.collections[0].get_datalim(returns.transData).ymax == 2.0

@@ -6,7 +6,6 @@ from hdrqn_torchrl.envs import (
     FullInformationPlanner,
     MultiGoalGridEnv,
     PerfectMemorySearch,
-    UniformRandom,
     ceiling,
     play_episodes,
     scripted_ceiling,
@@ -168,7 +167,7 @@ def test_players_avoid_obstacles_in_rollouts_over_many_episodes(player):
 
 
 def test_a_wider_view_is_never_worse():
-    steps = [scripted_ceiling("memory", view=view, episodes=300)["steps_mean"] for view in (3, 5, 9, None)]
+    steps = [scripted_ceiling("memory", view=view, episodes=300)["steps_mean"] for view in (3, 5, None)]
     assert steps == sorted(steps, reverse=True)
     assert steps[-1] == scripted_ceiling("planner", episodes=300)["steps_mean"]
 
