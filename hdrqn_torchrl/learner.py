@@ -27,6 +27,8 @@ class LearnerSettings:
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
         warmup_frames: environment frames before the first update.
         learning_rate: of Adam.
+        learning_rate_end: where it falls to, linearly, until ``learning_rate_frames``; ``None``: it stays.
+        learning_rate_frames: environment frames that this takes.
         tau: rate of the soft target update.
         max_grad_norm: gradients are clipped to this norm; ``None``: not at all.
         burn_in: share of a sequence left out of the loss at its beginning.
@@ -48,6 +50,8 @@ class LearnerSettings:
     frames_per_update: float = 8.0
     warmup_frames: int = 5_000
     learning_rate: float = 1e-3
+    learning_rate_end: float | None = None
+    learning_rate_frames: int = 1_000_000
     tau: float = 1e-3
     max_grad_norm: float | None = None
     burn_in: float = 0.5
@@ -65,6 +69,13 @@ class LearnerSettings:
             ("frames_per_update", self.frames_per_update > 0, "> 0", "use 8"),
             ("warmup_frames", self.warmup_frames >= 0, ">= 0", "use 5000"),
             ("learning_rate", self.learning_rate > 0, "> 0", "the paper uses 0.001"),
+            (
+                "learning_rate_end",
+                self.learning_rate_end is None or 0 < self.learning_rate_end <= self.learning_rate,
+                f"in (0, learning_rate={self.learning_rate}] or None",
+                "use None for a constant rate",
+            ),
+            ("learning_rate_frames", self.learning_rate_frames >= 1, ">= 1", "use the frames of the whole training"),
             ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
         )
@@ -127,10 +138,19 @@ class Learner:
         self.updates, self.frames = 0, 0
         self._warm_at = settings.warmup_frames  # or when the first transition came, if that is later
 
+    @property
+    def learning_rate(self) -> float:
+        """Adam's rate at the frames seen so far."""
+        start, end = self.settings.learning_rate, self.settings.learning_rate_end
+        progress = min(1.0, self.frames / self.settings.learning_rate_frames)
+        return start if end is None else start + (end - start) * progress
+
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
         self.frames += batch.numel()
         self._drawn = []
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate
         transitions = self.extract(batch)
         if transitions is not None:
             if not len(self.buffer):

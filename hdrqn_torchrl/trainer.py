@@ -108,6 +108,7 @@ class Trainer:
             "wall_seconds": round(self.wall_seconds, 2),
             **self._window.summary(self.frames),
             **{f"{name}/updates": learner.updates for name, learner in self.algorithm.learners.items()},
+            **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
             **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
         }
         if evaluation:

@@ -65,6 +65,15 @@ class TestUpdatesDue:
                 learner.update(learner.sample())
         assert made == [0, 1, 1, 0, 1, 1] and learner.updates == 4 and learner.frames == 96
 
+    def test_the_count_begins_with_the_first_transition(self):
+        """Options come out with the first finished episode: what could not be learned until then is not made up for."""
+        learner = make_learner(frames_per_update=16, extract=lambda batch: batch if learner.frames > 32 else None)
+        due = []
+        for _ in range(4):
+            learner.store(make_batch())
+            due.append(learner.updates_due())
+        assert due == [0, 0, 1, 2]
+
     def test_nothing_is_due_while_nothing_is_stored(self):
         learner = make_learner(extract=lambda batch: None)
         learner.store(make_batch())
@@ -127,6 +136,22 @@ class TestUpdate:
         assert parameter_distance(before, meta.loss.value_network_params.data) == 0
 
 
+class TestLearningRate:
+    def test_it_falls_linearly_and_then_stays(self):
+        learner = make_learner(learning_rate=1e-2, learning_rate_end=2e-3, learning_rate_frames=64)
+        rates = [learner.learning_rate]
+        for _ in range(5):
+            learner.store(make_batch())
+            rates.append(learner.learning_rate)
+            assert learner.optimizer.param_groups[0]["lr"] == learner.learning_rate
+        assert rates == pytest.approx([1e-2, 8e-3, 6e-3, 4e-3, 2e-3, 2e-3])
+
+    def test_it_stays_without_an_end(self):
+        learner = make_learner(learning_rate=1e-2, learning_rate_frames=16)
+        learner.store(make_batch())
+        assert learner.learning_rate == learner.optimizer.param_groups[0]["lr"] == 1e-2
+
+
 class TestSample:
     def test_one_draw_gives_several_minibatches_and_a_new_batch_discards_them(self):
         learner = make_learner(samples_per_draw=3, batch_size=5, slice_len=4)
@@ -170,6 +195,8 @@ class TestSettings:
             ("frames_per_update", 0.0, "> 0"),
             ("warmup_frames", -1, ">= 0"),
             ("learning_rate", 0.0, "> 0"),
+            ("learning_rate_end", 0.5, r"in \(0, learning_rate=0.001\] or None"),
+            ("learning_rate_frames", 0, ">= 1"),
             ("tau", 0.0, r"in \(0, 1\]"),
             ("tau", 1.5, r"in \(0, 1\]"),
             ("max_grad_norm", 0.0, "> 0 or None"),

@@ -15,7 +15,13 @@ def learned(name, total_frames, **options):
     torch.manual_seed(0)
     env = small_env(32, **TASK)
     settings = tiny_settings(
-        slice_len=8, batch_size=32, capacity=50_000, frames_per_update=20, warmup_frames=2_000, learning_rate=2e-3, tau=0.01
+        slice_len=8,
+        batch_size=32,
+        capacity=50_000,
+        frames_per_update=20,
+        warmup_frames=2_000,
+        learning_rate=2e-3,
+        tau=0.01,
     )
     algorithm = build(name, env, compact_network(32, (64,)), settings=settings, gamma=0.9, **options)
     evaluation_env = algorithm.transform(small_env(200, **TASK))
@@ -37,11 +43,13 @@ def schedule():
 
 @pytest.mark.slow
 def test_v2_solves_a_small_room():
-    after, before = learned("v2", 60_000, sub_exploration=schedule(), meta_exploration=schedule())
+    """Without the penalty it walks over the other goal in one episode out of six."""
+    schedules = {"sub_exploration": schedule(), "meta_exploration": schedule()}
+    after, before = learned("v2", 24_000, wrong_subgoal_reward=-1.0, **schedules)
     assert before < 0.5 and after >= 0.9
 
 
 @pytest.mark.slow
 def test_drqn_solves_a_small_room():
-    after, before = learned("drqn", 60_000, exploration=schedule())
+    after, before = learned("drqn", 45_000, exploration=schedule())
     assert before < 0.5 and after >= 0.9

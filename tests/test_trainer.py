@@ -131,6 +131,8 @@ class TestTime:
 class CountingLearner:
     """Owes a fixed number of updates for each batch."""
 
+    learning_rate = 0.001
+
     def __init__(self, due):
         self.due, self.updates, self.seen = due, 0, []
 
