@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data import OptionExtractor, StepSelector
+from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector, refresh_hidden
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.transforms import SubgoalTransform
@@ -102,6 +102,7 @@ def make_hdrqn(
     smdp_discount: bool = True,
     meta_input: Literal["hidden", "cell", "both"] = "hidden",
     meta_input_time: Literal["after_last_decision", "after_last_observation"] = "after_last_decision",
+    refresh_hidden_steps: int | None = None,
     mask_reached: bool = True,
     repeatable_subgoals: bool = False,
     wrong_subgoal_reward: float = 0.0,
@@ -122,6 +123,9 @@ def make_hdrqn(
             ``False``: plain sum and :math:`\gamma`.
         meta_input: which part of the LSTM state v2 reads.
         meta_input_time: whether that state includes the observation in which the last option ended.
+        refresh_hidden_steps: v2's states in the meta replay grow stale as the sub-controller learns. Given a number of
+            steps, they are computed anew from the stored observations after options of up to so many steps (the step
+            limit of an episode covers all). ``None`` keeps them as stored, like the paper.
         mask_reached: let the meta-controller choose only among subgoals not yet attained.
         repeatable_subgoals: whether subgoals can be attained again (then nothing is masked).
         wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one.
@@ -165,6 +169,10 @@ def make_hdrqn(
         mask_key=mask_key,
     )
     reads_last = version == "v2" and meta_input_time == "after_last_observation"
+    history, refresh = None, None
+    if version == "v2" and refresh_hidden_steps is not None:
+        history = OptionHistory(refresh_hidden_steps)
+        refresh = partial(refresh_hidden, sub_controller, refresh_hidden_steps, read_last_observation=reads_last)
     policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
     sub_learner = Learner(
         sub_controller,
@@ -187,7 +195,10 @@ def make_hdrqn(
         meta_controller,
         meta,
         extract=OptionExtractor(
-            input_keys=meta_keys, mask_key=mask_key, at_end=partial(_read_last, sub_controller) if reads_last else None
+            input_keys=meta_keys,
+            mask_key=mask_key,
+            at_end=partial(_read_last, sub_controller) if reads_last else None,
+            history=history,
         ),
         loss_keys={
             "action": keys.SUBGOAL,
@@ -196,6 +207,7 @@ def make_hdrqn(
             "action_mask": mask_key,
         },
         gamma=gamma,
+        refresh=refresh,
     )
 
     def make_transforms() -> Compose:

@@ -94,6 +94,7 @@ class Learner:
         loss_keys: keys of the loss, as in :meth:`RecurrentDQNLoss.set_keys`.
         gamma: discount of one environment step.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
+        refresh: applied to every minibatch before it is learned from.
         samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
             and one large draw costs little more than a small one.
 
@@ -110,9 +111,10 @@ class Learner:
         loss_keys: dict[str, NestedKey | None],
         gamma: float = 0.99,
         num_envs: int | None = None,
+        refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
-        self.network, self.settings, self.extract = network, settings, extract
+        self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
         self.loss = RecurrentDQNLoss(
             network,
             gamma=gamma,
@@ -167,7 +169,8 @@ class Learner:
         if not self._drawn:
             sequences = sample_sequences(self.buffer, self.settings.slice_len)
             self._drawn = list(sequences.split(self.settings.batch_size, 0))
-        return self._drawn.pop()
+        sample = self._drawn.pop()
+        return sample if self.refresh is None else self.refresh(sample)
 
     def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
         """One gradient step on ``sample`` and one soft update of the target network.

@@ -1,6 +1,15 @@
 """From collected steps to replayed sequences."""
 
+from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
 from hdrqn_torchrl.data.replay import StepSliceSampler, make_sequence_buffer, sample_sequences
 
-__all__ = ["OptionExtractor", "StepSelector", "StepSliceSampler", "make_sequence_buffer", "sample_sequences"]
+__all__ = [
+    "OptionExtractor",
+    "OptionHistory",
+    "StepSelector",
+    "StepSliceSampler",
+    "make_sequence_buffer",
+    "refresh_hidden",
+    "sample_sequences",
+]

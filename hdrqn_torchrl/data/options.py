@@ -11,6 +11,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.data.history import HISTORY, HISTORY_STEPS, HISTORY_SUBGOAL, OptionHistory
 
 
 class OptionExtractor:
@@ -31,6 +32,8 @@ class OptionExtractor:
         traj_key: number of the episode.
         at_end: changes the entries ``[M]`` of the steps at which options ended before they are kept; for inputs
             that the environment's step does not hold.
+        history: keeps the observations of whole options in the transitions, so that
+            :func:`~hdrqn_torchrl.data.refresh_hidden` can compute v2's inputs anew.
 
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -59,8 +62,10 @@ class OptionExtractor:
         init_key: NestedKey = keys.IS_INIT,
         traj_key: NestedKey = keys.TRAJ_IDS,
         at_end: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        history: OptionHistory | None = None,
     ) -> None:
-        self.at_end = at_end
+        self.at_end, self.history = at_end, history
+        self.init_key, self.option_steps_key = init_key, option_steps_key
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
         self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
         inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
@@ -73,6 +78,8 @@ class OptionExtractor:
         self._open_starts: TensorDictBase | None = None  # [N]: start of the option in progress
         self._is_open: Tensor | None = None  # [N]
         self._held: TensorDictBase | None = None  # [M]: finished options of unfinished episodes
+        if self.history is not None:
+            self.history.reset()
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase | None:
         """Returns the options ``[M]`` of all episodes that ended in ``batch`` ``[N, T]``; ``None`` if none did."""
@@ -86,6 +93,8 @@ class OptionExtractor:
         started = torch.cat([(self._is_open & ~started[:, 0]).unsqueeze(1), started], 1)
         ended = ended & (started.cumsum(1)[:, 1:] > 0)  # an option that started before the first batch is unknown
 
+        histories = None if self.history is None else self.history(batch, started[:, 1:], ended)
+
         # In each environment starts and ends alternate, so the j-th end closes the j-th start; a last start may
         # be left over. Both lists below are sorted by environment, then by time.
         self._is_open = started.sum(1) > ended.sum(1)
@@ -93,7 +102,13 @@ class OptionExtractor:
         environments = torch.arange(len(started), device=started.device)
         self._open_starts = starts[environments, last_start]
         started[environments, last_start] &= ~self._is_open
-        return self._release(self._pair(batch, starts, started, ended), num_envs=len(batch))
+        options = self._pair(batch, starts, started, ended)
+        if histories is not None:
+            after = options.get("next")
+            after.set(HISTORY, histories)
+            after.set(HISTORY_SUBGOAL, options.get(self.subgoal_key))
+            after.set(HISTORY_STEPS, after.get(self.option_steps_key))
+        return self._release(options, num_envs=len(batch))
 
     def _pair(self, batch: TensorDictBase, starts: TensorDictBase, started: Tensor, ended: Tensor) -> TensorDictBase:
         environment, end_time = ended.nonzero(as_tuple=True)
@@ -115,7 +130,16 @@ class OptionExtractor:
         complete = rows <= last_end[environment]
         self._held = options[~complete]
         released = options[complete].exclude("environment")
+        if self.history is not None:
+            self._look_back(released)
         return released if len(released) else None
+
+    def _look_back(self, options: TensorDictBase) -> None:
+        """Gives each option the history of the one before it in its episode: what its first input comes from."""
+        first = options.get(self.init_key)
+        for key in (HISTORY, HISTORY_SUBGOAL, HISTORY_STEPS):
+            before = options.get(("next", key)).roll(1, 0)
+            options.set(key, before.masked_fill(first.view(-1, *[1] * (before.ndim - 1)), 0))
 
     def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""

@@ -93,8 +93,8 @@ class PerfectMemorySearch:
         codes, unseen = self._codes[:, :-1], self._unseen[:, :-1]
         weight = unseen * (2.0 - unseen @ self._adjacent.T)
         gain = weight @ self._visible.T  # [N, cells]
-        worth_seeing = torch.where(rules.is_wall, torch.inf, -_HASTE * gain.log())
-        actions = _plan(rules, agent, codes, self._collected, self._in_order, worth_seeing)
+        search_cost = torch.where(rules.is_wall, torch.inf, -_HASTE * gain.log())
+        actions = _plan(rules, agent, codes, self._collected, self._in_order, search_cost)
         return tensordict.set(keys.ACTION, actions)
 
     def _forget(self, worlds: Tensor) -> None:
@@ -134,7 +134,7 @@ def _plan(
     codes: Tensor,
     collected: Tensor,
     in_order: Tensor,
-    worth_seeing: Tensor | None = None,
+    search_cost: Tensor | None = None,
 ) -> Tensor:
     """First action of the cheapest way to the next goal.
 
@@ -144,7 +144,7 @@ def _plan(
         codes: what stands where, as far as the player knows, ``[N, cells]`` uint8.
         collected: goals already collected, ``[N, K]`` bool.
         in_order: whether the order has been kept, ``[N]`` bool; once it is broken, any goal is as good as any other.
-        worth_seeing: cost of ending on a cell to look around, ``[N, cells]``; counts where the next goal is unknown.
+        search_cost: cost of ending on a cell to look around, ``[N, cells]``; counts where the next goal is unknown.
 
     Returns:
         ``[N]`` int64.
@@ -155,8 +155,8 @@ def _plan(
     worth = torch.where(in_order, rules.num_goals - num_collected, 0)
     loss = (codes == OBSTACLE) + (worth[:, None] + 0.5) * (is_goal & ~is_target)
     start = torch.where(is_target, 0.0, torch.inf)
-    if worth_seeing is not None:
-        start = torch.where(is_target.any(-1, keepdim=True), start, worth_seeing)
+    if search_cost is not None:
+        start = torch.where(is_target.any(-1, keepdim=True), start, search_cost)
     entry = (1.0 + _LOSS * loss).T.contiguous()  # [cells, N]: rows are copied whole, which is fast
     cost = _cost_to_go(start.T.contiguous(), entry, rules.moves)
     world = torch.arange(len(agent), device=agent.device)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.utils.rnn import pack_padded_sequence
 
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
@@ -124,3 +125,19 @@ class QNetwork(nn.Module):
         if init is None or not init[:, 1:].any():
             return self.head(self.memory(features)[0])
         return self.head(restarting_lstm(self.memory, features, init, self.initial_state(len(features))))
+
+    def final_state(self, observation: Tensor, condition: Tensor | None, lengths: Tensor) -> State:
+        """State at the end of sequences of different lengths that start from the zero state.
+
+        Args:
+            observation: ``[B, T, ...]``; what lies behind a sequence's end is not read.
+            condition: ``[B, T]`` int64, or ``None``.
+            lengths: ``[B]`` int64, between 1 and T.
+
+        Returns:
+            Hidden and cell state ``[B, H]``.
+        """
+        features = self._embed(observation, condition)
+        packed = pack_padded_sequence(features, lengths.cpu(), batch_first=True, enforce_sorted=False)
+        _, (hidden, cell) = self.memory(packed)
+        return hidden[0], cell[0]

@@ -1,0 +1,91 @@
+"""Observations of whole options, from which v2's stored states can be computed anew (refreshed)."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
+from torch import Tensor
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules import SubController
+
+HISTORY, HISTORY_STEPS, HISTORY_SUBGOAL = "history", "history_steps", "history_subgoal"
+
+
+class OptionHistory:
+    """Gathers what each of N environments observed during its option in progress, across batches.
+
+    Args:
+        max_steps: L; a longer option keeps its first L observations, which then can't be used.
+        observation_key: what is gathered.
+    """
+
+    def __init__(self, max_steps: int, observation_key: NestedKey = keys.OBSERVATION) -> None:
+        if max_steps < 1:
+            raise ValueError(f"max_steps must be >= 1, got {max_steps}; use the step limit of an episode.")
+        self.max_steps, self.observation_key = max_steps, observation_key
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the options in progress."""
+        self._seen: Tensor | None = None  # [N, L + 1, ...]
+        self._place: Tensor | None = None  # [N]
+
+    def __call__(self, batch: TensorDictBase, started: Tensor, ended: Tensor) -> Tensor:
+        """Takes a batch ``[N, T]`` with the starts and ends ``[N, T]`` of its options.
+
+        Returns:
+            For each end, by environment and then by time, the option's observations and the one that it ended in,
+            ``[M, L + 1, ...]``; what lies behind is undefined.
+        """
+        observation = batch.get(self.observation_key)
+        following = batch.get(unravel_key(("next", self.observation_key)))
+        if self._seen is None or self._place is None:
+            self._seen = observation.new_zeros((len(observation), self.max_steps + 1, *observation.shape[2:]))
+            self._place = torch.full_like(started[:, 0], -1, dtype=torch.int64)
+        environment = torch.arange(len(observation), device=observation.device)
+        kept = [self._seen[:0]]
+        for time in range(observation.shape[1]):
+            self._place = torch.where(started[:, time], 0, self._place + 1)
+            self._seen[environment, self._place.clamp(max=self.max_steps)] = observation[:, time]
+            rows = ended[:, time].nonzero().squeeze(-1)
+            histories = self._seen[rows]
+            last = (self._place[rows] + 1).clamp(max=self.max_steps)
+            histories[torch.arange(len(rows), device=rows.device), last] = following[rows, time]
+            kept.append(histories)
+        end_time, end_environment = ended.t().nonzero(as_tuple=True)  # in the order of `kept`
+        return torch.cat(kept)[(end_environment * ended.shape[1] + end_time).argsort()]
+
+
+@torch.no_grad()
+def refresh_hidden(
+    sub_controller: SubController, max_steps: int, sample: TensorDictBase, *, read_last_observation: bool = False
+) -> TensorDictBase:
+    """Computes the sub-controller's states in option transitions anew, with its present weights.
+
+    Args:
+        sub_controller: whose states they are.
+        max_steps: L of :class:`OptionHistory`; states after longer options stay as they were stored.
+        sample: transitions ``[B, T]`` of an ``OptionExtractor(history=...)``.
+        read_last_observation: whether the states include the observation in which the option ended.
+
+    Returns:
+        ``sample``, with new states at its root (where the last option ended) and under ``"next"``.
+    """
+    for part in (sample, sample.get("next")):
+        steps = part.get(HISTORY_STEPS).squeeze(-1).flatten()  # [B * T]; 0: the episode starts, the state is zero
+        rows = ((steps > 0) & (steps <= max_steps)).nonzero().squeeze(-1)
+        if not len(rows):
+            continue
+        lengths = steps[rows] + int(read_last_observation)
+        histories = part.get(HISTORY).flatten(0, 1)[rows][:, : int(lengths.max())]
+        subgoals = part.get(HISTORY_SUBGOAL).flatten()[rows].unsqueeze(-1).expand(histories.shape[:2])
+        for key, state in zip(
+            (sub_controller.hidden_key, sub_controller.cell_key),
+            sub_controller.network.final_state(histories, subgoals, lengths),
+            strict=True,
+        ):
+            if (stored := part.get(key, None)) is not None:
+                part.set(key, stored.flatten(0, 1).index_copy(0, rows, state).view_as(stored))
+    return sample
