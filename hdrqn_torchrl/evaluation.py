@@ -21,9 +21,9 @@ _SUMMED = {
 class EpisodeTracker:
     """Sums what happens in each of N environments and reports the episodes that end.
 
-    Reported per episode: ``return``, ``extrinsic``, ``intrinsic`` (0 for flat agents), ``success`` (1 if the whole
-    task was completed), ``in_order`` (subgoals reached in the proper order, i.e. steps with an extrinsic reward
-    of at least 1) and ``steps``.
+    Reported per episode: ``return``, ``extrinsic``, ``intrinsic`` (hierarchical agents), ``success`` (1 if the whole
+    task was completed), ``in_order`` (share of subgoals reached in the proper order, i.e. with an extrinsic
+    reward of at least 1) and ``steps``.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class EpisodeTracker:
             The sums ``[N]`` up to and including this step; those of ended episodes are cleared afterwards.
         """
         step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after}
-        step["in_order"] = (step["extrinsic"] >= 1.0).float()
+        step["in_order"] = (step["extrinsic"] >= 1.0).float() / after.get(keys.ATTAINED).shape[-1]
         step["steps"] = torch.ones_like(step["return"])
         sums = TensorDict(step, after.batch_size, device=after.device)
         if self.sums is not None:
@@ -83,13 +83,12 @@ def evaluate(
         torch.manual_seed(seed)
         rounds = [_play_once(env, policy) for _ in range(-(-episodes // env.batch_size[0]))]
     played: TensorDictBase = torch.cat(rounds, 0)  # type: ignore[assignment]
-    num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
     return {
         "return_mean": _mean(played["return"]),
         "extrinsic_mean": _mean(played["extrinsic"]),
         "intrinsic_mean": _mean(played["intrinsic"]) if "intrinsic" in played else 0.0,
         "success_rate": _mean(played["success"]),
-        "in_order_rate": _mean(played["in_order"]) / num_subgoals,
+        "in_order_rate": _mean(played["in_order"]),
         "steps_mean": _mean(played["steps"]),
         "episodes": len(played),
     }
