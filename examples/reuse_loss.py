@@ -4,7 +4,7 @@ Task: CartPole without velocities. One observation says where cart and pole are;
 Network: ``MLP -> LSTMModule -> MLP -> QValueModule``. From this project come ``RecurrentDQNLoss``, which unrolls any
 such network over replayed sequences, and ``make_sequence_buffer``, which draws them.
 
-Run ``python examples/reuse_loss.py [--updates 4000]``.
+Run ``python examples/reuse_loss.py [--updates 2500]``.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def greedy_return(env: TransformedEnv, policy: TensorDictSequential) -> float:
 def main() -> None:
     """Trains and prints the greedy return before and after."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--updates", type=int, default=4000)
+    parser.add_argument("--updates", type=int, default=2500)
     updates = parser.parse_args().updates
     torch.set_num_threads(1)
     torch.manual_seed(0)

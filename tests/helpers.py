@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import torch
 from tensordict import TensorDictBase
 from torchrl.collectors import Collector
@@ -70,6 +72,23 @@ def collect(algorithm: Algorithm, env: MultiGoalGridEnv, steps: int, batches: in
     taken = [batch.clone() for batch, _ in zip(collector, range(batches), strict=False)]
     collector.shutdown()
     return taken
+
+
+@cache
+def random_play(num_envs, length, seed=0, first_traj=0):
+    """Consecutive steps ``[N, length]`` of random play; episodes last up to 5 steps."""
+    torch.manual_seed(seed)
+    env = subgoal_env(num_envs, env_settings={"max_steps": 5, "seed": seed}, max_option_steps=3)
+    steps = env.rollout(length, break_when_any_done=False)
+    episode = steps["is_init"].squeeze(-1).cumsum(-1) - 1
+    steps["collector", "traj_ids"] = first_traj + episode + 1_000 * torch.arange(num_envs)[:, None]
+    steps["extra"], steps["next", "extra"] = torch.rand(2, num_envs, length)
+    return steps
+
+
+def batches_of(steps: TensorDictBase, length: int) -> list[TensorDictBase]:
+    """Cuts steps ``[N, T]`` into whole batches ``[N, length]``."""
+    return [steps[:, start : start + length] for start in range(0, steps.shape[1] - length + 1, length)]
 
 
 def unroll_by_steps(network, observation, condition=None, init=None):

@@ -56,6 +56,15 @@ def test_the_policy_is_made_of_what_the_learners_train(name):
     assert epsilons <= {id(buffer) for buffer in algorithm.policy.buffers()}
 
 
+def value_everything_at(learner, value):
+    """Makes the target network's Q-values the same everywhere."""
+    streams = learner.loss.target_value_network_params["network", "head", "streams"]
+    with torch.no_grad():
+        for parameter in streams.values():
+            parameter.zero_()
+        streams["bias"][0] = value
+
+
 class TestOptions:
     """Each option changes something."""
 
@@ -86,11 +95,46 @@ class TestOptions:
         options["is_init"].fill_(True)
         options["next", "option_steps"].fill_(3)
         options["next", "option_return"].fill_(0.25)
-        with torch.no_grad():
-            for parameter in meta.loss.target_value_network_params["network", "head", "streams"].values():
-                parameter.zero_()
-            meta.loss.target_value_network_params["network", "head", "streams", "bias"][0] = 8.0  # Q' = 8
+        value_everything_at(meta, 8.0)
         assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
+
+    def test_for_the_sub_controller_a_reached_subgoal_is_the_end_and_a_time_limit_is_not(self):
+        algorithm, batch = self.steps(gamma=0.5, max_option_steps=2)
+        sub, after = algorithm.learners["sub"], batch["next"]
+        value_everything_at(sub, 8.0)
+        reached = after["subgoal_reached"] & ~after["terminated"]
+        timed_out = after["option_done"] & ~after["subgoal_reached"] & ~after["terminated"]
+        for rows, following in ((reached, 0.0), (timed_out, 0.5 * 8.0)):
+            steps = sub.extract(batch)[rows.squeeze(-1)].unsqueeze(1)
+            steps["option_init"].fill_(True)
+            wanted = steps["next", "intrinsic_reward"].mean().item() + following
+            assert len(steps) and sub.loss(steps)["target"].item() == pytest.approx(wanted, abs=1e-5)
+
+    def test_in_mid_sequence_a_time_limit_is_left_out_and_the_next_option_restarts(self):
+        algorithm, batch = self.steps(max_option_steps=2)
+        sub = algorithm.learners["sub"]
+        steps = sub.extract(batch)[:, :4]
+        no_end = (~steps["next", "done"][:, :3].any(1) & ~steps["next", "option_terminated"].any(1)).squeeze(-1)
+        steps = steps[no_end]  # two options of two steps each
+        assert len(steps) and steps["next", "option_done"][:, 1].all()
+        assert sub.loss(steps)["trained_steps"] == 3 * len(steps)
+
+    @pytest.mark.parametrize(("mask_reached", "following"), [(True, 2.0), (False, 8.0)])
+    def test_a_subgoal_that_is_gone_has_no_part_in_the_meta_target(self, mask_reached, following):
+        algorithm, batch = self.steps(mask_reached=mask_reached, smdp_discount=False, gamma=0.5)
+        meta = algorithm.learners["meta"]
+        options = meta.extract(batch)[:, None]
+        options = options[~options["next", "terminated"].flatten()]
+        options["is_init"].fill_(True)
+        if mask_reached:
+            options["next", "subgoal_mask"] = torch.tensor([False, True]).expand(len(options), 1, 2)
+        value_everything_at(meta, 5.0)
+        with torch.no_grad():  # Q = V + A - mean(A): 5 + 3 and 5 - 3
+            meta.loss.target_value_network_params["network", "head", "streams", "bias"][1] = 6.0
+            meta.network.network.head.streams.weight.zero_()
+            meta.network.network.head.streams.bias.copy_(torch.tensor([0.0, 1.0, 0.0]))  # prefers subgoal 0
+        wanted = options["next", "option_return"].mean().item() + 0.5 * following
+        assert meta.loss(options)["target"].item() == pytest.approx(wanted)
 
     def test_mask_reached(self):
         for mask_reached in (True, False):

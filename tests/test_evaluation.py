@@ -2,7 +2,7 @@ import pytest
 import torch
 from helpers import RIGHT, build, collect, small_env
 from tensordict.nn import TensorDictModule
-from torchrl.envs import ExplorationType
+from torchrl.envs import ExplorationType, set_exploration_type
 
 from hdrqn_torchrl.evaluation import EpisodeTracker, evaluate
 
@@ -50,9 +50,27 @@ class TestEvaluate:
     @pytest.fixture
     def agent(self):
         torch.manual_seed(0)
-        env = small_env(8)
+        env = small_env(16, max_steps=40)
         algorithm = build("v2", env)
         return algorithm.transform(env), algorithm.policy
+
+    def test_the_first_episode_of_every_environment_counts_and_no_other(self, agent):
+        env, policy = agent
+        env.set_seed(3)
+        torch.manual_seed(3)
+        with set_exploration_type(ExplorationType.RANDOM):
+            steps = env.rollout(40, policy, break_when_any_done=False)["next"]
+        sums = {"reward": 0.0, "intrinsic_reward": 0.0, "steps": 0}
+        for played in steps.unbind(0):
+            first = played[: int(played["done"].flatten().long().argmax()) + 1]
+            sums["steps"] += len(first)
+            for key in ("reward", "intrinsic_reward"):
+                sums[key] += first[key].sum().item()
+        longest = int(steps["done"].squeeze(-1).long().argmax(1).max()) + 1
+        assert (steps["done"][:, :longest].sum(1) > 1).any()  # some finished a second one in the meantime
+        result = evaluate(env, policy, episodes=len(steps), seed=3, exploration_type=ExplorationType.RANDOM)
+        found = (result["return_mean"], result["intrinsic_mean"], result["steps_mean"])
+        assert found == pytest.approx([total / len(steps) for total in sums.values()], abs=1e-6)
 
     def test_one_seed_gives_the_same_numbers_whatever_came_before(self, agent):
         env, policy = agent

@@ -5,8 +5,10 @@ import json
 import math
 import os
 import runpy
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -218,3 +220,31 @@ def test_a_sweep_runs_one_job_after_the_other(tmp_path):
     for folder, recurrent in zip(folders, (False, True), strict=True):
         check_run_folder(folder, frames=640)
         assert OmegaConf.load(folder / "config.yaml").algo.recurrent == recurrent
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_what_there_is(tmp_path):
+    endless = [setting for setting in TINY if "total_frames" not in setting]
+    command = [
+        sys.executable,
+        str(ROOT / "train.py"),
+        *endless,
+        *TINY_HDRQN,
+        "hydra.run.dir=run",
+        "total_frames=100000000",
+    ]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    try:
+        metrics = tmp_path / "run" / "metrics.csv"
+        for _ in range(1_200):
+            if metrics.exists() and len(metrics.read_text().splitlines()) > 3:
+                break
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.1)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode not in (0, None) and "interrupted" in told
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["frames"] > 0 and (tmp_path / "run" / "checkpoints" / "last.safetensors").exists()

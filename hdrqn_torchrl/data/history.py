@@ -57,6 +57,16 @@ class OptionHistory:
         end_time, end_environment = ended.t().nonzero(as_tuple=True)  # in the order of `kept`
         return torch.cat(kept)[(end_environment * ended.shape[1] + end_time).argsort()]
 
+    def state_dict(self) -> dict[str, Tensor | None]:
+        """Observations of the options in progress."""
+        seen = None if self._seen is None else self._seen.clone()  # it is written in place
+        return {"seen": seen, "place": self._place}
+
+    def load_state_dict(self, state: dict[str, Tensor | None]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        seen = state["seen"]
+        self._seen, self._place = None if seen is None else seen.clone(), state["place"]
+
 
 @torch.no_grad()
 def refresh_hidden(

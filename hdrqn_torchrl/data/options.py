@@ -65,7 +65,7 @@ class OptionExtractor:
         history: OptionHistory | None = None,
     ) -> None:
         self.at_end, self.history = at_end, history
-        self.init_key, self.option_steps_key = init_key, option_steps_key
+        self.init_key, self.traj_key, self.option_steps_key = init_key, traj_key, option_steps_key
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
         self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
         inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
@@ -136,18 +136,23 @@ class OptionExtractor:
 
     def _look_back(self, options: TensorDictBase) -> None:
         """Gives each option the history of the one before it in its episode: what its first input comes from."""
-        first = options.get(self.init_key)
+        traj = options.get(self.traj_key)
+        first = options.get(self.init_key).flatten() | (traj != traj.roll(1))  # or its predecessor is unknown
+        first[:1] = True
         for key in (HISTORY, HISTORY_SUBGOAL, HISTORY_STEPS):
             before = options.get(("next", key)).roll(1, 0)
             options.set(key, before.masked_fill(first.view(-1, *[1] * (before.ndim - 1)), 0))
 
     def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""
-        return {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
+        state = {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
+        return state if self.history is None else {**state, "history": self.history.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._open_starts, self._is_open, self._held = state["open_starts"], state["is_open"], state["held"]
+        if self.history is not None:
+            self.history.load_state_dict(state["history"])
 
 
 class StepSelector:

@@ -1,4 +1,4 @@
-"""Replay memories that give back sequences (section IV-C of the paper)."""
+"""Replay memories that give back sequences (section III-B of the paper)."""
 
 from __future__ import annotations
 

@@ -23,6 +23,26 @@ class Task(NamedTuple):
 
 MEASURED_EPISODES = 20_000
 MEASURED: dict[Task, tuple[float, float, float]] = {  # return_mean, success_rate, steps_mean
+    Task("planner", "open", 2, 50, None): (2.000, 1.0000, 12.1),
+    Task("memory", "open", 2, 50, None): (2.000, 1.0000, 12.1),
+    Task("memory", "open", 2, 50, 5): (2.000, 1.0000, 15.5),
+    Task("memory", "open", 2, 50, 3): (2.000, 0.9997, 22.5),
+    Task("random", "open", 2, 50, None): (-0.910, 0.0315, 48.8),
+    Task("planner", "open", 3, 50, None): (3.000, 1.0000, 18.1),
+    Task("memory", "open", 3, 50, None): (3.000, 1.0000, 18.1),
+    Task("memory", "open", 3, 50, 5): (3.000, 0.9999, 21.8),
+    Task("memory", "open", 3, 50, 3): (2.991, 0.9913, 29.6),
+    Task("random", "open", 3, 50, None): (-0.961, 0.0022, 49.8),
+    Task("planner", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
+    Task("memory", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
+    Task("memory", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
+    Task("memory", "four_rooms", 2, 50, 3): (1.949, 0.9907, 25.2),
+    Task("random", "four_rooms", 2, 50, None): (-1.170, 0.0231, 49.0),
+    Task("planner", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
+    Task("memory", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
+    Task("memory", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
+    Task("memory", "four_rooms", 3, 100, 3): (2.882, 0.9892, 34.1),
+    Task("random", "four_rooms", 3, 100, None): (-2.566, 0.0056, 98.8),
 }
 
 

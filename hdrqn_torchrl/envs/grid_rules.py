@@ -219,9 +219,8 @@ class GridRules:
         collected = state.objects[:, self.num_obstacles :] == self.nowhere
         collected_bits, attained_bits = (collected * self._goal_bits).sum(-1), (attained * self._goal_bits).sum(-1)
         reached = attained_bits > 0
-        in_order = state.in_order & (
-            attained_bits == collected_bits + 1
-        )  # {0..k-1} collected is 2^k - 1, goal k is 2^k
+        is_next = attained_bits == collected_bits + 1  # {0..k-1} collected is 2^k - 1, goal k is 2^k
+        in_order = state.in_order & is_next
         extrinsic = torch.where(in_order, 1.0, 0.01) * reached
         objects = torch.where(met, self.nowhere, state.objects)
         objects[:, : self.num_obstacles] = state.objects[:, : self.num_obstacles]

@@ -16,7 +16,7 @@ from hdrqn_torchrl.envs.grid_rules import ACTIONS, GridRules, GridState, StepEve
 
 
 class MultiGoalGridEnv(EnvBase):
-    """Goals to be reached in order on a grid, seen through a window around the agent (section V of the paper).
+    """Goals to be reached in order on a grid, seen through a window around the agent (section IV of the paper).
 
     **Description.** Agent, two obstacles and K goals stand on distinct random free cells of an 11x11 map
     ("open", or "four_rooms" with inner walls and four doors). ``num_envs`` worlds step together as tensors.

@@ -1,9 +1,10 @@
 import pytest
 import torch
+from helpers import batches_of, random_play
 from torchrl.collectors import Collector
 
 from hdrqn_torchrl.algorithms import make_hdrqn
-from hdrqn_torchrl.data import OptionHistory
+from hdrqn_torchrl.data import OptionExtractor, OptionHistory
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.learner import LearnerSettings
 from hdrqn_torchrl.modules import compact_network
@@ -82,3 +83,65 @@ def test_a_refreshed_sample_is_learned_from():
 def test_max_steps_must_be_positive():
     with pytest.raises(ValueError, match="max_steps must be >= 1, got 0"):
         OptionHistory(0)
+
+
+HISTORY = ("history", "history_steps", "history_subgoal")
+
+
+def extract(steps, carry=lambda extractor: extractor):
+    """Options with their histories, batch by batch; ``carry`` may replace the extractor between two batches."""
+    extractor, taken = OptionExtractor(history=OptionHistory(5)), []
+    for batch in batches_of(steps, 3):
+        options = extractor(batch)
+        taken += [] if options is None else [options]
+        extractor = carry(extractor)
+    return torch.cat(taken, 0)
+
+
+def assert_same_histories(options, expected):
+    for part, wanted in ((options, expected), (options["next"], expected["next"])):
+        steps = part["history_steps"].flatten()
+        assert (steps == wanted["history_steps"].flatten()).all()
+        assert (part["history_subgoal"] == wanted["history_subgoal"])[steps > 0].all()
+        for row, length in enumerate(steps.tolist()):
+            assert length == 0 or (part["history"][row, : length + 1] == wanted["history"][row, : length + 1]).all()
+
+
+def test_a_history_is_that_of_the_option_before_in_the_same_episode():
+    options = extract(random_play(4, 60))
+    same = options["collector", "traj_ids"][1:] == options["collector", "traj_ids"][:-1]
+    assert (options["history_steps"][1:][same] == options["next", "option_steps"][:-1][same]).all()
+    assert not options["history_steps"][options["is_init"]].any()
+
+
+@pytest.mark.parametrize("num_envs", [1, 6])
+def test_an_option_whose_predecessor_is_unknown_has_no_history(num_envs):
+    """The first batch begins in mid-episode: what was observed before it belongs to nobody."""
+    steps = random_play(num_envs, 62)[:, 2:]
+    options = extract(steps)
+    traj = options["collector", "traj_ids"]
+    first = torch.cat([torch.tensor([True]), traj[1:] != traj[:-1]])
+    assert (first & ~options["is_init"].flatten()).any()
+    assert not options["history_steps"][first].any()
+
+
+def test_a_state_dict_carries_the_options_in_progress():
+    def carry(extractor):
+        successor = OptionExtractor(history=OptionHistory(5))
+        successor.load_state_dict(extractor.state_dict())
+        return successor
+
+    steps = random_play(4, 60)
+    assert_same_histories(extract(steps, carry), extract(steps))
+
+
+def test_a_state_dict_is_a_snapshot():
+    steps = random_play(4, 60)
+    extractor, successor = (OptionExtractor(history=OptionHistory(5)) for _ in range(2))
+    extractor(steps[:, :20])
+    snapshot = extractor.state_dict()
+    extractor(steps[:, 40:])
+    successor.load_state_dict(snapshot)
+    reference = OptionExtractor(history=OptionHistory(5))
+    reference(steps[:, :20])
+    assert_same_histories(successor(steps[:, 20:40]), reference(steps[:, 20:40]))

@@ -1,28 +1,10 @@
-from functools import cache
-
 import pytest
 import torch
-from helpers import subgoal_env
+from helpers import batches_of, random_play
 
 from hdrqn_torchrl.data import OptionExtractor, StepSelector
 
 SHAPES = [(1, 2), (3, 2), (3, 3), (6, 17), (5, 1), (1, 17)]
-
-
-@cache
-def make_steps(num_envs, length, seed=0, first_traj=0):
-    """Consecutive steps ``[N, length]`` of random play; episodes last up to 5 steps."""
-    torch.manual_seed(seed)
-    env = subgoal_env(num_envs, env_settings={"max_steps": 5, "seed": seed}, max_option_steps=3)
-    steps = env.rollout(length, break_when_any_done=False)
-    episode = steps["is_init"].squeeze(-1).cumsum(-1) - 1
-    steps["collector", "traj_ids"] = first_traj + episode + 1_000 * torch.arange(num_envs)[:, None]
-    steps["extra"], steps["next", "extra"] = torch.rand(2, num_envs, length)
-    return steps
-
-
-def batches_of(steps, length):
-    return [steps[:, start : start + length] for start in range(0, steps.shape[1] - length + 1, length)]
 
 
 class PlainExtractor:
@@ -62,14 +44,14 @@ def assert_same(options, expected):
 class TestAgainstPlainLoops:
     def test_over_many_batches(self, num_envs, length):
         extractor, plain, options = OptionExtractor(), PlainExtractor(), 0
-        for batch in batches_of(make_steps(num_envs, 102), length):
+        for batch in batches_of(random_play(num_envs, 102), length):
             expected = plain(batch)
             assert_same(extractor(batch), expected)
             options += len(expected)
         assert options >= 20 * num_envs
 
     def test_when_the_first_batch_begins_in_mid_episode(self, num_envs, length):
-        steps = make_steps(num_envs, 54)
+        steps = random_play(num_envs, 54)
         steps = steps[:, 2:] if num_envs > 1 else steps[:, 1:]
         assert not steps["option_init"][:, 0].all()
         extractor, plain = OptionExtractor(), PlainExtractor()
@@ -80,13 +62,13 @@ class TestAgainstPlainLoops:
         extractor, plain = OptionExtractor(), PlainExtractor()
         whole = 4 * length if length > 5 else 6 * length + (0 if length > 1 else 2)
         for part in range(3):
-            steps = make_steps(num_envs, whole, seed=part, first_traj=100 * part)
+            steps = random_play(num_envs, whole, seed=part, first_traj=100 * part)
             for batch in batches_of(steps, length):
                 assert_same(extractor(batch), plain(batch))
 
     def test_a_state_dict_carries_it_over(self, num_envs, length):
         extractor, plain = OptionExtractor(), PlainExtractor()
-        for batch in batches_of(make_steps(num_envs, 51), length):
+        for batch in batches_of(random_play(num_envs, 51), length):
             successor = OptionExtractor()
             successor.load_state_dict(extractor.state_dict())
             extractor = successor
@@ -96,7 +78,7 @@ class TestAgainstPlainLoops:
 class TestOptions:
     def extract(self, **settings):
         extractor = OptionExtractor(**settings)
-        taken = [extractor(batch) for batch in batches_of(make_steps(6, 102), 6)]
+        taken = [extractor(batch) for batch in batches_of(random_play(6, 102), 6)]
         return torch.cat([options for options in taken if options is not None], 0)
 
     def test_the_end_of_an_option_is_the_start_of_the_next_and_differs_from_its_own_start(self):
@@ -118,7 +100,7 @@ class TestOptions:
         assert (options["next", "done"].squeeze(-1) == last).all()
 
     def test_every_step_of_the_finished_episodes_belongs_to_one_option(self):
-        steps, extractor = make_steps(6, 102), OptionExtractor()
+        steps, extractor = random_play(6, 102), OptionExtractor()
         options = extractor(steps)
         finished = sum(
             int(env["next", "done"].squeeze(-1).nonzero().max()) + 1 for env in steps.unbind(0)
@@ -139,7 +121,7 @@ class TestOptions:
         assert (changed["observation"] == plain["observation"]).all()
 
     def test_reset_forgets_options_and_episodes_in_progress(self):
-        steps = make_steps(6, 20)
+        steps = random_play(6, 20)
         extractor, plain = OptionExtractor(), PlainExtractor()
         extractor(steps[:, :8])
         extractor.reset()
@@ -148,7 +130,7 @@ class TestOptions:
 
     def test_keys_can_be_renamed(self):
         names = ("option_init", "option_done", "option_steps", "option_return", "active_subgoal")
-        steps, plain = make_steps(4, 30), OptionExtractor()
+        steps, plain = random_play(4, 30), OptionExtractor()
         renamed = steps.clone()
         for name in names:
             for part in (renamed, renamed["next"]):
@@ -167,7 +149,7 @@ class TestOptions:
 class TestStepSelector:
     def test_it_keeps_what_is_asked_for_and_the_ends_of_the_episode(self):
         select = StepSelector(root_keys=["observation"], next_keys=["extra"])
-        steps = make_steps(2, 6)
+        steps = random_play(2, 6)
         kept = select(steps)
         assert set(kept.keys(True, True)) == {
             "observation", ("collector", "traj_ids"), ("next", "extra"), ("next", "done"), ("next", "terminated"),
@@ -176,14 +158,14 @@ class TestStepSelector:
         assert (kept["next", "extra"] == steps["next", "extra"]).all()
 
     def test_the_subgoal_in_force_stands_on_both_sides_of_a_step(self):
-        steps = make_steps(4, 30)
+        steps = random_play(4, 30)
         kept = StepSelector(root_keys=["subgoal"], next_keys=["observation"], subgoal_key="subgoal")(steps)
         assert (kept["subgoal"] == steps["next", "active_subgoal"]).all()
         assert (kept["next", "subgoal"] == steps["next", "active_subgoal"]).all()
         assert (kept["subgoal"] != steps["subgoal"]).any()  # random play proposes at every step
 
     def test_the_batch_is_left_as_it_was(self):
-        steps = make_steps(2, 6)
+        steps = random_play(2, 6)
         before = steps.clone()
         StepSelector(root_keys=["subgoal"], next_keys=["observation"], subgoal_key="subgoal")(steps)
         OptionExtractor()(steps)

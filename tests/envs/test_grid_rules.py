@@ -179,6 +179,7 @@ def test_the_window_is_centred_on_the_agent_and_shows_walls_outside_the_map():
 @pytest.mark.parametrize("layout", ["open", "four_rooms", UNWALLED])
 def test_without_a_view_every_object_is_seen_from_everywhere(layout):
     rules = GridRules(layout, view=None)
+    assert rules.view == {"open": 19, "four_rooms": 19, UNWALLED: 9}[layout]  # the walls around are seen as well
     windows = rules.observe(rules.sample(500))
     for code in (FIRST_GOAL, FIRST_GOAL + 1):
         assert ((windows == code).flatten(1).sum(-1) == 1).all()
