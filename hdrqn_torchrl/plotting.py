@@ -79,7 +79,9 @@ def plot_comparison(
             points = [dict(zip(run["frames"], run[column], strict=True)) for run in seeds]
             frames = [x for x in seeds[0]["frames"] if all(not np.isnan(run.get(x, np.nan)) for run in points)]
             values = np.array([[run[x] for x in frames] for run in points])
-            axis.plot(frames, values.mean(0), marker=".", label=f"{name} ({len(seeds)} seeds)")
+            axis.plot(
+                frames, values.mean(0), marker=".", label=f"{name} ({len(seeds)} seed{'s' if len(seeds) > 1 else ''})"
+            )
             axis.fill_between(frames, values.min(0), values.max(0), alpha=0.2)
         _reference_lines(axis, references or {}, reference)
         axis.set(xlabel="environment frames", title=f"greedy evaluation: {label}")
