@@ -49,7 +49,7 @@ def references_for(env: EnvBase) -> References:
     """What the scripted players achieve on the task of ``env``, by name; empty for tasks that have none."""
     if not isinstance(env, MultiGoalGridEnv):
         return {}
-    return {player: ceiling(player, **env.task) for player in ("planner", "memory", "random")}
+    return {player: ceiling(player, env) for player in ("planner", "memory", "random")}
 
 
 def ceiling_of(references: References) -> float | None:

@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterator
+from typing import NamedTuple
 
+from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
 from hdrqn_torchrl.envs.scripted import PlayerName, scripted_ceiling
 
 
@@ -46,28 +47,12 @@ MEASURED: dict[Task, tuple[float, float, float]] = {  # return_mean, success_rat
 }
 
 
-def ceiling(
-    player: PlayerName = "memory",
-    *,
-    layout: str | Sequence[str] = "open",
-    num_goals: int = 2,
-    view: int | None = 5,
-    max_steps: int = 50,
-    obstacle: Literal["stay", "teleport"] = "stay",
-    num_obstacles: int = 2,
-    episodes: int = 1000,
-    seed: int = 0,
-) -> dict[str, float]:
-    """What a scripted player achieves: looked up for the paper's tasks, simulated for all others.
+def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, seed: int = 0) -> dict[str, float]:
+    """What a scripted player achieves on a task: looked up for the paper's tasks, simulated for all others.
 
     Args:
         player: ``"planner"`` (full information), ``"memory"`` (remembers all it saw) or ``"random"``.
-        layout: as in :class:`~hdrqn_torchrl.envs.MultiGoalGridEnv`, like all up to ``num_obstacles``.
-        num_goals: K.
-        view: side of the window in cells, or ``None`` for the whole map.
-        max_steps: step limit of an episode.
-        obstacle: ``"stay"`` or ``"teleport"``.
-        num_obstacles: number of obstacles.
+        env: the environment whose task is meant; it is not played.
         episodes: number of episodes of a simulation.
         seed: seed of a simulation.
 
@@ -79,25 +64,17 @@ def ceiling(
         ValueError: if an argument breaks its rule.
 
     Examples:
-        >>> ceiling(layout="four_rooms", num_goals=3, max_steps=100, view=3)["episodes"]
+        >>> ceiling("memory", MultiGoalGridEnv(layout="four_rooms", num_goals=3, max_steps=100, view=3))["episodes"]
         20000
     """
-    if obstacle == "stay" and num_obstacles == 2 and isinstance(layout, str):
-        figures = MEASURED.get(Task(player, layout, num_goals, max_steps, view if player == "memory" else None))
+    task = env.task
+    if task["obstacle"] == "stay" and task["num_obstacles"] == 2 and isinstance(task["layout"], str):
+        view = task["view"] if player == "memory" else None
+        figures = MEASURED.get(Task(player, task["layout"], task["num_goals"], task["max_steps"], view))
         if figures is not None:
             names = ("return_mean", "success_rate", "steps_mean")
             return dict(zip(names, figures, strict=True)) | {"episodes": MEASURED_EPISODES}
-    return scripted_ceiling(
-        player,
-        layout=layout,
-        num_goals=num_goals,
-        view=view,
-        max_steps=max_steps,
-        obstacle=obstacle,
-        num_obstacles=num_obstacles,
-        episodes=episodes,
-        seed=seed,
-    )
+    return scripted_ceiling(player, **task, episodes=episodes, seed=seed)
 
 
 def standard_tasks() -> Iterator[Task]:

@@ -94,7 +94,10 @@ class MultiGoalGridEnv(EnvBase):
 
     def _make_specs(self) -> None:
         n, view, goals, device = self.num_envs, self.rules.view, self.rules.num_goals, self.device
-        flag = lambda *shape: Binary(shape=(n, *shape), dtype=torch.bool, device=device)  # noqa: E731
+
+        def flag(size: int) -> Binary:
+            return Binary(shape=(n, size), dtype=torch.bool, device=device)
+
         cells = Categorical(self.rules.num_codes, shape=(n, view, view), dtype=torch.uint8, device=device)
         self.observation_spec = Composite(
             {keys.OBSERVATION: cells, keys.ATTAINED: flag(goals), keys.HAZARD: flag(1), keys.SUCCESS: flag(1)},

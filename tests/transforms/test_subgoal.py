@@ -235,3 +235,14 @@ class TestAlongEpisodes:
         for key in CARRIED:
             assert (after[key][[0, 2]] == before[key][[0, 2]]).all(), key
             assert (after[key][1] != before[key][1]).all(), key
+
+    def test_an_environment_that_resets_itself_keeps_its_neighbours_book(self):
+        """TorchRL merges the rows of an ordinary partial reset; after a native one only the transform does."""
+        env = subgoal_env(3)
+        played = env.rollout(4, break_when_any_done=False)[:, -1]["next"]
+        played["option_steps"] = torch.tensor([[3], [4], [5]])
+        played["_reset"] = torch.tensor([[False], [True], [False]])
+        fresh = env.transform._reset_on_native_autoreset(played.clone(), played.clone())
+        assert fresh["option_steps"].tolist() == [[3], [0], [5]]
+        assert torch.equal(fresh["active_subgoal"][[0, 2]], played["active_subgoal"][[0, 2]])
+        assert fresh["option_init"][1]
