@@ -1,13 +1,218 @@
-"""Weights of a run as safetensors files: loading one can't run code."""
+"""Checkpoints of a whole training, on ``torchrl.checkpoint``: durable, verified, and unable to run code.
+
+TorchRL's ``Checkpoint`` writes a folder beside its destination and renames it, and its ``CheckpointRotation`` keeps
+the last and the best. Added here: tensors in safetensors and everything else in JSON, so that no file is ever
+unpickled; every byte on the disk (fsync) before a checkpoint gets its name; a checksum of every file, checked
+before anything is loaded; removal of what killed writes left behind.
+"""
 
 from __future__ import annotations
 
+import json
 import os
+import shutil
+import sys
+import warnings
+import zlib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import nn
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError, CheckpointRotation
+
+TENSORS, STRUCTURE, CHECKSUMS = "tensors.safetensors", "structure.json", "checksums.json"
+SCORE = "greedy_return"
+_UNSCORED = -sys.float_info.max  # the rotation wants a finite number; this one is never the best
+
+
+class SafetensorsAdapter(CheckpointAdapter):
+    """Writes a component's ``state_dict`` as one safetensors file and one JSON file.
+
+    TorchRL's own adapter falls back to ``torch.load`` when it meets a pickle; this one has nothing to fall back to.
+    A state may nest dicts, lists, tuples, tensors, TensorDicts, numbers, strings and ``None``.
+    """
+
+    adapter_id = "hdrqn_torchrl.safetensors"
+
+    def save(self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
+        path.mkdir(parents=True, exist_ok=True)
+        tensors: dict[str, Tensor] = {}
+        structure = _encode(component.state_dict(), tensors, "")
+        save_file(_without_aliases(tensors), path / TENSORS)
+        (path / STRUCTURE).write_text(json.dumps(structure))
+
+    def load(
+        self,
+        component: Any,
+        path: Path,
+        *,
+        map_location: Any,
+        tensor_load_kwargs: Mapping[str, Any],
+        args: tuple[Any, ...],
+        kwargs: Mapping[str, Any],
+    ) -> None:
+        device = torch.device(map_location or "cpu")
+        structure = json.loads((path / STRUCTURE).read_text())
+        component.load_state_dict(_decode(structure, load_file(path / TENSORS), device))
+
+
+class DurableCheckpoint(Checkpoint):
+    """TorchRL's ``Checkpoint`` with checksums, written to the disk before it gets its name.
+
+    Args:
+        **components: objects with ``state_dict`` and ``load_state_dict``.
+    """
+
+    def __init__(self, **components: Any) -> None:
+        super().__init__()
+        for name, component in components.items():
+            self.register(name, component, adapter=SafetensorsAdapter())
+
+    @staticmethod
+    def _publish_path(source: Path, destination: Path) -> None:
+        files = sorted(path for path in source.rglob("*") if path.is_file())
+        sums = {path.relative_to(source).as_posix(): _checksum(path) for path in files}
+        (source / CHECKSUMS).write_text(json.dumps(sums))
+        for path in (source, *source.rglob("*")):
+            _sync(path)
+        Checkpoint._publish_path(source, destination)
+        _sync(destination.parent)
+
+
+class Checkpoints:
+    """The checkpoints in one folder: saves, keeps the last few and the best, finds the newest that is whole.
+
+    Args:
+        directory: where they lie; created with the first save.
+        keep_last: how many of the newest are kept, beside the best by greedy return.
+
+    Raises:
+        ValueError: if ``keep_last`` is less than 2.
+
+    Examples:
+        >>> import tempfile
+        >>> checkpoints = Checkpoints(Path(tempfile.mkdtemp()))
+        >>> source, target = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
+        >>> path = checkpoints.save({"policy": source}, step=100)
+        >>> checkpoints.load({"policy": target}, path)
+        >>> bool((source.weight == target.weight).all())
+        True
+    """
+
+    def __init__(self, directory: Path, *, keep_last: int = 2) -> None:
+        if keep_last < 2:
+            raise ValueError(f"keep_last must be >= 2, got {keep_last}; one must stay while the newest is replaced.")
+        self.directory = directory
+        self._rotation = CheckpointRotation(directory, keep_last=keep_last, keep_best=(SCORE, "max"))
+
+    def save(self, components: Mapping[str, Any], *, step: int, score: float | None = None) -> Path:
+        """Writes a checkpoint and removes those that are no longer kept.
+
+        Args:
+            components: objects with ``state_dict``, by name.
+            step: its place in the order, e.g. environment frames.
+            score: what makes it the best, if it was measured for these very weights.
+
+        Raises:
+            CheckpointError: if it can't be written; earlier checkpoints are untouched.
+        """
+        try:
+            metadata = {SCORE: _UNSCORED if score is None else score}
+            return self._rotation.save(DurableCheckpoint(**components), step=step, metadata=metadata)
+        except (OSError, SafetensorError) as error:
+            newest = self.newest()
+            left = f"the last good one is {newest}" if newest else "there is no earlier one"
+            raise CheckpointError(
+                f"the checkpoint at step {step} can't be written to {self.directory} ({error}); {left}. "
+                "Make room or make the folder writable, then resume the run."
+            ) from error
+
+    def load(self, components: Mapping[str, Any], path: Path, device: torch.device | str = "cpu") -> None:
+        """Restores components from the checkpoint ``path`` after checking all of it.
+
+        Raises:
+            CheckpointError: if the checkpoint is not whole, or does not fit the components.
+        """
+        verify(path)
+        DurableCheckpoint(**components).load(path, map_location=device)
+
+    def newest(self) -> Path | None:
+        """The newest checkpoint that is whole; a warning tells of damaged ones that were passed over."""
+        for path in reversed(self._rotation.checkpoints()):
+            try:
+                verify(path)
+            except CheckpointError as error:
+                warnings.warn(f"{error} The one before it is taken.", stacklevel=2)
+            else:
+                return path
+        return None
+
+    def best(self) -> Path | None:
+        """The checkpoint with the best score, or the newest if none has one."""
+        best = self._rotation.best()
+        if best is None or Checkpoint.manifest(best)["metadata"][SCORE] == _UNSCORED:
+            return self.newest()
+        return best
+
+    def clean_up(self) -> None:
+        """Removes what killed writes left behind. Call it when no other process writes here."""
+        for orphan in self.directory.glob(".checkpoint-*"):
+            name, _, kind = orphan.name[1:].rpartition(".")
+            if kind.startswith("backup-") and not (self.directory / name).exists():
+                orphan.rename(self.directory / name)  # killed between the two renames of a replacement
+            elif orphan.is_dir():
+                shutil.rmtree(orphan)
+            else:
+                orphan.unlink()
+
+
+def verify(path: Path) -> None:
+    """Checks that a checkpoint is complete and unchanged since it was written.
+
+    Raises:
+        CheckpointError: if it is not, naming the file at fault.
+    """
+    try:
+        sums = json.loads((path / CHECKSUMS).read_text())
+        if not isinstance(sums, dict) or not {"manifest.json"} <= set(sums):
+            raise ValueError("it lists no files")
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} is not a checkpoint of this package ({CHECKSUMS}: {error}).") from error
+    for name, expected in sums.items():
+        file = path / name
+        if not file.is_file():
+            raise CheckpointError(f"{path} is not complete: {name} is missing.")
+        if _checksum(file) != expected:
+            raise CheckpointError(f"{path} is damaged: {name} is not what was written.")
+
+
+def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
+    """Loads a policy's weights from a run.
+
+    Args:
+        policy: built with the settings of the run.
+        directory: the run's folder of checkpoints.
+        which: ``"best"``, ``"last"``, or the path of a checkpoint or of a file of :func:`save_weights`.
+
+    Raises:
+        ValueError: if there is none, it is damaged, or it does not fit.
+    """
+    checkpoints = Checkpoints(directory)
+    path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
+    if path is None:
+        raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
+    if path.is_file():
+        load_weights(policy, path)
+        return
+    try:
+        checkpoints.load({"policy": policy}, path)
+    except CheckpointError as error:
+        raise ValueError(f"checkpoint can't be loaded: {error}") from error
 
 
 def save_weights(module: nn.Module, path: Path) -> None:
@@ -15,9 +220,9 @@ def save_weights(module: nn.Module, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     save_file({name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}, partial)
-    with partial.open("rb+") as file:
-        os.fsync(file.fileno())
+    _sync(partial)
     partial.replace(path)
+    _sync(path.parent)
 
 
 def load_weights(module: nn.Module, path: Path) -> None:
@@ -38,3 +243,77 @@ def load_weights(module: nn.Module, path: Path) -> None:
         module.load_state_dict(weights)
     except RuntimeError as error:
         raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
+
+
+def _encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
+    """``value`` as JSON; its tensors go to ``tensors``, by the path that leads to them."""
+
+    def inner(key: Any, item: Any) -> Any:
+        return _encode(item, tensors, f"{name}/{key}" if name else str(key))
+
+    if isinstance(value, Tensor):
+        assert name not in tensors, name
+        tensors[name] = value.detach()
+        return {"tensor": name}
+    if isinstance(value, TensorDictBase):
+        items = {key: inner(key, item) for key, item in value.items()}
+        return {"tensordict": items, "batch_size": list(value.batch_size), "names": list(value.names)}
+    if isinstance(value, Mapping):
+        return {"dict": [[key, inner(key, item)] for key, item in value.items()]}
+    for kind, type_ in (("size", torch.Size), ("tuple", tuple), ("list", list)):
+        if isinstance(value, type_):
+            return {kind: [inner(index, item) for index, item in enumerate(value)]}
+    if isinstance(value, torch.device):
+        return {"device": str(value)}
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"a state may hold tensors, numbers, strings and containers of them, got {type(value)} at {name}.")
+
+
+def _decode(value: Any, tensors: Mapping[str, Tensor], device: torch.device) -> Any:
+    """The inverse of :func:`_encode`."""
+    if not isinstance(value, dict):
+        return value
+    kind = next(iter(value))
+    content = value[kind]
+    if kind == "tensor":
+        return tensors[content].to(device, copy=True)  # a copy, as the original is mapped from the file
+    if kind == "tensordict":
+        items = {key: _decode(item, tensors, device) for key, item in content.items()}
+        names = value["names"] if any(value["names"]) else None
+        return TensorDict(items, batch_size=value["batch_size"], device=device, names=names)
+    if kind == "dict":
+        return {key: _decode(item, tensors, device) for key, item in content}
+    if kind == "device":
+        return device
+    return {"size": torch.Size, "tuple": tuple, "list": list}[kind](_decode(item, tensors, device) for item in content)
+
+
+def _without_aliases(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Copies tensors that share memory with others, which safetensors refuses; the rest is written from its place."""
+    seen: set[int] = set()
+    unshared = {}
+    for name, tensor in tensors.items():
+        tensor = tensor.cpu().contiguous()
+        memory = tensor.untyped_storage().data_ptr()
+        unshared[name] = tensor.clone() if memory in seen else tensor
+        seen.add(memory)
+    return unshared
+
+
+def _checksum(path: Path) -> list[int]:
+    """Size and CRC-32 of a file."""
+    value = 0
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            value = zlib.crc32(block, value)
+    return [path.stat().st_size, value]
+
+
+def _sync(path: Path) -> None:
+    """Waits until a file or the entries of a folder are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

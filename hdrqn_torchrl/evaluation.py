@@ -51,6 +51,14 @@ class EpisodeTracker:
             ended.append(self.add(after)[after.get(keys.DONE).squeeze(-1)])
         return torch.cat(ended, 0)
 
+    def state_dict(self) -> dict[str, TensorDictBase | None]:
+        """Sums of the episodes in progress."""
+        return {"sums": self.sums}
+
+    def load_state_dict(self, state: dict[str, TensorDictBase | None]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.sums = state["sums"]
+
 
 @torch.no_grad()
 def evaluate(

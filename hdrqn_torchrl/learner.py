@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -14,6 +14,22 @@ from torchrl.objectives import SoftUpdate
 
 from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
+
+
+class NonFiniteError(ArithmeticError):
+    """A number that training depends on became NaN or infinite."""
+
+
+class Extract(Protocol):
+    """Turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet."""
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase | None: ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What it carries from batch to batch."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +106,8 @@ class Learner:
     Args:
         network: the controller that is trained; the policy acts with the same parameters.
         settings: how it learns.
-        extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet.
+        extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet; with
+            ``state_dict`` and ``load_state_dict``.
         loss_keys: keys of the loss, as in :meth:`RecurrentDQNLoss.set_keys`.
         gamma: discount of one environment step.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
@@ -107,7 +124,7 @@ class Learner:
         network: TensorDictModuleBase,
         settings: LearnerSettings,
         *,
-        extract: Callable[[TensorDictBase], TensorDictBase | None],
+        extract: Extract,
         loss_keys: dict[str, NestedKey | None],
         gamma: float = 0.99,
         num_envs: int | None = None,
@@ -178,13 +195,53 @@ class Learner:
         Returns:
             Scalars without gradient: ``loss``, ``td_error``, ``q_value``, ``target``, ``trained_steps`` and, if
             gradients are clipped, ``grad_norm``.
+
+        Raises:
+            NonFiniteError: if loss or gradient is; the weights are as they were.
         """
         metrics = dict(self.loss(sample).items())
         self.optimizer.zero_grad()
         metrics["loss"].backward()
+        gradients = [parameter.grad for parameter in self._parameters if parameter.grad is not None]
+        norm = torch.nn.utils.get_total_norm(gradients)
+        if not torch.isfinite(metrics["loss"] + norm):
+            raise NonFiniteError(self._explain_non_finite(metrics["loss"]))
         if self.settings.max_grad_norm is not None:
-            metrics["grad_norm"] = torch.nn.utils.clip_grad_norm_(self._parameters, self.settings.max_grad_norm)
+            torch.nn.utils.clip_grads_with_norm_(self._parameters, self.settings.max_grad_norm, norm)
+            metrics["grad_norm"] = norm
         self.optimizer.step()
         self.target_updater.step()
         self.updates += 1
         return {name: value.detach() for name, value in metrics.items()}
+
+    def _explain_non_finite(self, loss: Tensor) -> str:
+        """Names what is not finite, looked up only once something is."""
+        where = f"in update {self.updates + 1}, frame {self.frames}"
+        if not torch.isfinite(loss):
+            return f"the loss became {loss.item()} {where}"
+        for name, parameter in self.network.named_parameters():
+            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
+                return f"the gradient of {name} became NaN or infinite {where}"
+        return f"the gradient's norm became infinite {where}"
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that learning depends on: both networks, optimiser, replay memory, counters."""
+        return {
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "buffer": self.buffer.state_dict(),
+            "extract": self.extract.state_dict(),
+            "drawn": self._drawn,
+            "updates": self.updates,
+            "frames": self.frames,
+            "warm_at": self._warm_at,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.buffer.load_state_dict(state["buffer"])
+        self.extract.load_state_dict(state["extract"])
+        self._drawn = list(state["drawn"])
+        self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]

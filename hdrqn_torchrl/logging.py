@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import os
 import sys
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -30,9 +32,10 @@ class CSVLog:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.columns = path, list[str]()
+        self.path, self.columns, self.rows = path, list[str](), 0
         if path.exists():
-            self.columns = path.read_text().split("\n", 1)[0].split(",")
+            rows = self._read()
+            self.columns, self.rows = list(rows[0]) if rows else [], len(rows)
 
     def write(self, row: Row) -> None:
         """Appends one row; it is on the disk when this returns."""
@@ -40,19 +43,37 @@ class CSVLog:
             self._widen(new)
         with self.path.open("a", newline="") as file:
             csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(row)
+            file.flush()
+            os.fsync(file.fileno())
+        self.rows += 1
 
     def _widen(self, new: list[str]) -> None:
-        rows = []
-        if self.path.exists():
-            with self.path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
-        self.columns += new
+        self._rewrite([*self.columns, *new], self._read() if self.path.exists() else [])
+
+    def _read(self) -> list[dict[str, str]]:
+        """All whole rows; a killed process may have left half of one at the end."""
+        text = self.path.read_text()
+        return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+
+    def _rewrite(self, columns: list[str], rows: list[dict[str, str]]) -> None:
+        self.columns, self.rows = columns, len(rows)
         partial = self.path.with_suffix(".partial")
         with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.columns, restval="", lineterminator="\n")
+            writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore", lineterminator="\n")
             writer.writeheader()
             writer.writerows(rows)
+            file.flush()
+            os.fsync(file.fileno())
         partial.replace(self.path)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its position: columns and number of rows."""
+        return {"columns": list(self.columns), "rows": self.rows}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes back to a position: later rows are dropped from the file, as they will be written again."""
+        if self.path.exists():
+            self._rewrite(list(state["columns"]), self._read()[: state["rows"]])
 
 
 class RunLogger:
@@ -99,6 +120,15 @@ class RunLogger:
         self._progress.update(self._task, completed=frames, numbers=numbers)
         if evaluated and not self.console.is_terminal:
             self.console.print(f"{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its position in the files."""
+        return {"csv": self.csv.state_dict(), "last_greedy": self._last_greedy}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes back to a position; see :meth:`CSVLog.load_state_dict`."""
+        self.csv.load_state_dict(state["csv"])
+        self._last_greedy = state["last_greedy"]
 
     def close(self) -> None:
         """Stops the progress bar."""

@@ -1,8 +1,12 @@
-"""What a finished run leaves behind: ``summary.json`` and ``curves.png`` beside its metrics and weights."""
+"""What a run leaves in its folder beside metrics and checkpoints, and who may write there."""
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from torchrl.envs import EnvBase
@@ -38,11 +42,39 @@ def write_results(
         "wall_seconds": round(trainer.wall_seconds, 1),
         "ceiling": ceiling_of(references),
     }
-    partial = folder / "summary.json.partial"
-    partial.write_text(json.dumps(summary, indent=2) + "\n")
-    partial.replace(folder / "summary.json")
+    write_whole(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     plot_run(read_metrics(folder / "metrics.csv"), folder / "curves.png", title=title, references=references)
     return summary
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Writes a text file that is either whole or the one before, whatever happens."""
+    partial = path.with_name(f"{path.name}.partial")
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keeps other processes from training in the same folder; the lock ends with the process, however it ends.
+
+    Raises:
+        ValueError: if another process trains there, or nothing can be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / ".lock").open("w")
+    except OSError as error:
+        raise ValueError(f"the run folder must be writable, got {folder} ({error}); choose another one.") from error
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"{folder} is in use: another process is training there; wait or stop it.") from error
+        yield
 
 
 def references_for(env: EnvBase) -> References:

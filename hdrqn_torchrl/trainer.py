@@ -8,33 +8,45 @@ learners draws from its own.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import unravel_key
 from torch import Tensor
+from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import BaseCollector
 
+from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.checkpoint import save_weights
+from hdrqn_torchrl.checkpoint import Checkpoints
 from hdrqn_torchrl.evaluation import EpisodeTracker
+from hdrqn_torchrl.interruption import Interrupted, StopRequest
+from hdrqn_torchrl.learner import NonFiniteError
 from hdrqn_torchrl.logging import Row, RunLogger
 
 
 class Trainer:
-    """Collects, stores, updates, logs and evaluates until ``total_frames`` are done.
+    """Collects, stores, updates, logs, evaluates and saves until ``total_frames`` are done.
+
+    An iteration can be cut between any two updates: what is left of it is owed, and done first when the training
+    goes on. A training that was stopped and resumed is bit for bit the one that was not.
 
     Args:
         algorithm: policy and learners.
-        collector: yields batches ``[N, T]`` from the transformed environment.
+        collector: yields batches ``[N, T]`` from the transformed environment. If ``checkpoints`` are given it must
+            keep its state (:class:`~hdrqn_torchrl.collectors.ResumableCollector`).
         logger: where log points go.
         evaluate: plays greedy episodes and returns their averages (:func:`~hdrqn_torchrl.evaluation.evaluate`).
         total_frames: environment frames to collect.
         log_frames: frames between log points.
         evaluation_frames: frames between greedy evaluations; the first comes before training.
-        checkpoints: folder for weights; ``last.safetensors`` and ``best.safetensors`` (by greedy return) are written
-            at evaluations and at the end. ``None``: nothing is written.
+        checkpoints: where the whole training is saved; ``None``: nowhere.
+        checkpoint_frames: frames between checkpoints.
+        checkpoint_seconds: seconds after which one is written in any case.
         ceiling: return of a scripted player, logged beside the greedy one.
     """
 
@@ -48,20 +60,25 @@ class Trainer:
         total_frames: int,
         log_frames: int = 10_000,
         evaluation_frames: int = 50_000,
-        checkpoints: Path | None = None,
+        checkpoints: Checkpoints | None = None,
+        checkpoint_frames: int = 50_000,
+        checkpoint_seconds: float = 600.0,
         ceiling: float | None = None,
     ) -> None:
         self.algorithm, self.collector, self.logger, self.evaluate = algorithm, collector, logger, evaluate
         self.total_frames, self.log_frames, self.evaluation_frames = total_frames, log_frames, evaluation_frames
-        self.checkpoints, self.ceiling = checkpoints, ceiling
+        self.checkpoints, self.checkpoint_frames = checkpoints, checkpoint_frames
+        self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
-        self._tracker = EpisodeTracker()
-        self._window = _Window()
-        self._started = time.monotonic()
+        self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
+        self._tracker, self._window = EpisodeTracker(), _Window()
+        self._stop = StopRequest()
+        self._started = self._saved_at = time.monotonic()
+        self._saved_position: tuple | None = None
 
     @property
     def wall_seconds(self) -> float:
-        """Seconds since the trainer was built."""
+        """Seconds of training, those before an interruption included."""
         return time.monotonic() - self._started
 
     @property
@@ -70,37 +87,77 @@ class Trainer:
         return sum(learner.updates for learner in self.algorithm.learners.values())
 
     def train(self) -> None:
-        """Runs to ``total_frames``. Weights are kept when it is interrupted, too."""
+        """Runs to ``total_frames``.
+
+        Raises:
+            Interrupted: on SIGINT or SIGTERM, after saving. A second signal does not wait for that.
+            NonFiniteError: before a NaN or an infinity reaches the weights.
+            CheckpointError: if the training can't be saved.
+        """
         try:
-            self.log(evaluation=True)
-            for batch in self.collector:
-                self.step(batch)
-                if self.frames >= self.total_frames:
-                    break
+            with self._stop:
+                self._run()
         finally:
-            self.save("last")
             self.logger.close()
+
+    def _run(self) -> None:
+        try:
+            self._complete_iteration()
+            if self.frames < self.total_frames:
+                for batch in self.collector:
+                    self.step(batch)
+                    if self.frames >= self.total_frames:
+                        break
+            self.save()
+        except Interrupted:
+            self.save()
+            raise
+        except NonFiniteError as error:
+            newest = None if self.checkpoints is None else self.checkpoints.newest()
+            left = f"The last good checkpoint is {newest}." if newest else "There is no checkpoint."
+            raise NonFiniteError(f"{error}; training stopped before it could reach the weights. {left}") from error
 
     def step(self, batch: TensorDictBase) -> None:
         """One iteration on a collected batch ``[N, T]``."""
-        before, self.frames = self.frames, self.frames + batch.numel()
+        self._receive(batch)
+        self._complete_iteration()
+
+    def _receive(self, batch: TensorDictBase) -> None:
+        """Counts and stores a collected batch ``[N, T]``."""
+        check_finite(batch, self.frames)
+        self.frames += batch.numel()
         finished = self._tracker.finished(batch)
         self.episodes += len(finished)
         self._window.add_episodes(finished)
-        for name, learner in self.algorithm.learners.items():
+        for learner in self.algorithm.learners.values():
             learner.store(batch)
-            for _ in range(learner.updates_due()):
-                self._window.add_update(name, learner.update(learner.sample()))
         for exploration in self.algorithm.explorations.values():
             exploration.step(batch.numel())
-        self.collector.update_policy_weights_()
-        done = self.frames >= self.total_frames
-        evaluation = done or crossed(before, self.frames, self.evaluation_frames)
-        if evaluation or crossed(before, self.frames, self.log_frames):
-            self.log(evaluation=evaluation)
 
-    def log(self, *, evaluation: bool) -> None:
-        """Writes one log point, after a greedy evaluation if asked for."""
+    def _complete_iteration(self) -> None:
+        """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
+        for name, learner in self.algorithm.learners.items():
+            for _ in range(learner.updates_due()):
+                self._stop.check()
+                self._window.add_update(name, learner.update(learner.sample()))
+        self.collector.update_policy_weights_()
+        before, best = self._completed, False
+        if before != self.frames:
+            evaluation = self._due(self.evaluation_frames) or self.frames >= self.total_frames
+            if evaluation or self._due(self.log_frames):
+                best = self.log(evaluation=evaluation)
+            self._completed = self.frames
+        late = time.monotonic() - self._saved_at >= self.checkpoint_seconds
+        if before is not None and (best or late or crossed(before, self.frames, self.checkpoint_frames)):
+            self.save(score=self.best_return if best else None)
+        self._stop.check()
+
+    def _due(self, interval: int) -> bool:
+        """Whether a multiple of ``interval`` was passed in this iteration; at the very beginning, too."""
+        return self._completed is None or crossed(self._completed, self.frames, interval)
+
+    def log(self, *, evaluation: bool) -> bool:
+        """Writes one log point, after a greedy evaluation if asked for. Returns whether that was the best so far."""
         row: Row = {
             "frames": self.frames,
             "episodes": self.episodes,
@@ -111,29 +168,97 @@ class Trainer:
             **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
             **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
         }
+        best = False
         if evaluation:
-            result = self.evaluate()
+            with self._stop.at_once():
+                result = self.evaluate()
             row |= {
                 f"greedy/{name.removesuffix('_mean').removesuffix('_rate')}": value for name, value in result.items()
             }
             if self.ceiling is not None:
                 row["greedy/ceiling"] = self.ceiling
-            self.save("last")
-            if result["return_mean"] > self.best_return:
+            if best := result["return_mean"] > self.best_return:
                 self.best_return = result["return_mean"]
-                self.save("best")
         self.logger.log(row)
         self._window = _Window(self.frames)
+        return best
 
-    def save(self, name: str) -> None:
-        """Writes the policy's weights to ``checkpoints/<name>.safetensors``."""
-        if self.checkpoints is not None:
-            save_weights(self.algorithm.policy, self.checkpoints / f"{name}.safetensors")
+    def save(self, *, score: float | None = None) -> None:
+        """Writes a checkpoint of the whole training, unless nothing happened since the last one.
+
+        Args:
+            score: greedy return of these very weights, if it is the best so far.
+        """
+        if self.checkpoints is not None and self._position != self._saved_position:
+            self.checkpoints.save(self._components(), step=self.frames, score=score)
+            self._saved_at, self._saved_position = time.monotonic(), self._position
+
+    def resume(self, path: Path) -> None:
+        """Restores everything from a checkpoint; :meth:`train` then goes on from there.
+
+        Raises:
+            CheckpointError: if the checkpoint is damaged or of another kind of training.
+        """
+        assert self.checkpoints is not None
+        device = next(self.algorithm.policy.parameters()).device
+        self.checkpoints.load(self._components(), path, device=device)
+        self.collector.update_policy_weights_()
+        self._saved_at, self._saved_position = time.monotonic(), self._position
+
+    @property
+    def _position(self) -> tuple[int, int, int | None]:
+        return self.frames, self.updates, self._completed
+
+    def _components(self) -> dict[str, Any]:
+        """All that a training consists of. They are restored in the order of their names."""
+        return {
+            "collector": self.collector,
+            **{f"learner-{name}": learner for name, learner in self.algorithm.learners.items()},
+            "logger": self.logger,
+            "policy": self.algorithm.policy,
+            "random": GlobalRNGState(),
+            "trainer": self,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its own counters; the parts have theirs."""
+        return {
+            "frames": self.frames,
+            "episodes": self.episodes,
+            "best_return": self.best_return,
+            "completed": self._completed,
+            "wall_seconds": self.wall_seconds,
+            "tracker": self._tracker.state_dict(),
+            "window": self._window.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
+        self._completed = state["completed"]
+        self._started = time.monotonic() - state["wall_seconds"]
+        self._tracker.load_state_dict(state["tracker"])
+        self._window.load_state_dict(state["window"])
 
 
 def crossed(before: int, after: int, interval: int) -> bool:
     """Whether a multiple of ``interval`` lies in (before, after]."""
     return before // interval < after // interval
+
+
+def check_finite(batch: TensorDictBase, frames: int) -> None:
+    """Refuses a collected batch with a NaN or an infinity in it, the observation first.
+
+    Raises:
+        NonFiniteError: naming the entry and the place.
+    """
+    entries = [(key, value) for key, value in batch.items(True, True) if value.is_floating_point()]
+    entries.sort(key=lambda entry: keys.OBSERVATION not in entry[0])
+    for key, value in entries:
+        if not torch.isfinite(value).all():
+            name = ".".join(key) if isinstance(unravel_key(key), tuple) else key
+            row = (~torch.isfinite(value.flatten(1, -1) if value.ndim > 1 else value)).nonzero()[0, 0].item()
+            raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {row}, after frame {frames}")
 
 
 class _Window:
@@ -165,3 +290,16 @@ class _Window:
             row |= {f"{learner}/{name}": (total / count).item() for name, total in sums.items()}
             row[f"{learner}/updates_per_second"] = round(count / seconds, 1)
         return row
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "frames": self._frames,
+            "seconds": time.monotonic() - self._since,
+            "episodes": self._episodes,
+            "sums": self._sums,
+            "counts": self._counts,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._frames, self._since = state["frames"], time.monotonic() - state["seconds"]
+        self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]

@@ -189,3 +189,10 @@ class StepSelector:
             steps.set(self.subgoal_key, in_force)
             after.set(self.subgoal_key, in_force)
         return steps.set("next", after)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: it looks at one batch at a time."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Takes what :meth:`state_dict` returned."""

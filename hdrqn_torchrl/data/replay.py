@@ -63,6 +63,30 @@ class StepSliceSampler(SliceSampler):
         return tuple(index), {keys.PAD_MASK: mask.flatten()}
 
 
+class SequenceStorage(LazyTensorStorage):
+    """TorchRL's storage, whose state includes where it was written last.
+
+    Without that, the first samples after a restart join the newest step in the ring to the oldest.
+    """
+
+    def state_dict(self) -> dict[str, Any]:
+        if not self.initialized:
+            return {"stored": None}
+        stored = self[:]  # the part that was written
+        return {"stored": stored, "rows": len(self._storage), "last_cursor": self._last_cursor_index}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        stored = state_dict["stored"]
+        self.initialized = stored is not None
+        if stored is None:
+            self._storage, self._len = None, 0
+            return
+        self._storage = stored[:1].expand(state_dict["rows"], *stored.shape[1:]).clone()
+        self._storage[: len(stored)] = stored
+        self._len = stored.numel()
+        self._set_last_cursor(state_dict["last_cursor"])
+
+
 def make_sequence_buffer(
     capacity: int,
     *,
@@ -122,7 +146,7 @@ def make_sequence_buffer(
     else:
         raise ValueError(f"sampling must be 'steps' or 'episodes', got {sampling!r}; the paper's is 'episodes'.")
     return TensorDictReplayBuffer(
-        storage=LazyTensorStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
+        storage=SequenceStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
         sampler=sampler,
         batch_size=batch_size * slice_len,
     )

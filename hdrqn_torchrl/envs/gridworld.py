@@ -167,6 +167,22 @@ class MultiGoalGridEnv(EnvBase):
         self.steps = self.steps + 1
         return self._outcome(events)
 
+    def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
+        """All worlds and the generator of their layouts: what a resumed run needs."""
+        return {**self.state._asdict(), "steps": self.steps, "generator": self._generator.get_state()}
+
+    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it is the state of another number of worlds.
+        """
+        if len(state_dict["steps"]) != self.num_envs:
+            raise ValueError(f"state_dict must hold {self.num_envs} worlds, got {len(state_dict['steps'])}.")
+        self.state = GridState(*(state_dict[name].to(self.device) for name in GridState._fields))
+        self.steps = state_dict["steps"].to(self.device)
+        self._generator.set_state(state_dict["generator"].cpu())
+
     def _outcome(self, events: StepEvents) -> TensorDictBase:
         terminated = events.all_collected
         truncated = (self.steps >= self.max_steps) & ~terminated

@@ -1,0 +1,288 @@
+"""From settings to built objects: rules for every setting, the allow-list of what may be built, runs read back.
+
+Beside the entry points this is the only file that knows hydra and omegaconf.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hydra.core.config_store import ConfigStore
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from hdrqn_torchrl.algorithms import Algorithm
+
+ALLOWED_TARGETS = (
+    "hdrqn_torchrl.envs.MultiGoalGridEnv",
+    "hdrqn_torchrl.algorithms.make_dqn",
+    "hdrqn_torchrl.algorithms.make_drqn",
+    "hdrqn_torchrl.algorithms.make_hdqn",
+    "hdrqn_torchrl.algorithms.make_hdrqn",
+    "hdrqn_torchrl.learner.LearnerSettings",
+    "hdrqn_torchrl.modules.EpsilonGreedy",
+    "hdrqn_torchrl.modules.compact_network",
+    "hdrqn_torchrl.modules.paper_network",
+    "hdrqn_torchrl.logging.make_tensorboard_logger",
+    "hdrqn_torchrl.logging.make_wandb_logger",
+    "hdrqn_torchrl.logging.make_mlflow_logger",
+)
+"""What a ``_target_`` may name. One's own builders are added with ``allowed_targets=[package.builder]``."""
+
+
+@dataclass
+class EvaluationSchema:
+    """Greedy evaluation."""
+
+    num_envs: int = MISSING
+    episodes: int = MISSING
+    interval_frames: int = MISSING
+    final_episodes: int = MISSING
+    seed: int = MISSING
+
+
+@dataclass
+class CheckpointSchema:
+    """When the whole training is saved."""
+
+    interval_frames: int = MISSING
+    interval_minutes: float = MISSING
+    keep_last: int = MISSING
+
+
+@dataclass
+class Schema:
+    """Top-level settings and their types; a key that is not here is refused."""
+
+    env: Any = MISSING
+    algo: Any = MISSING
+    network: Any = MISSING
+    logger: Any = MISSING
+    seed: int = MISSING
+    device: str = MISSING
+    threads: int = MISSING
+    total_frames: int = MISSING
+    steps_per_batch: int = MISSING
+    log_frames: int = MISSING
+    evaluation: EvaluationSchema = field(default_factory=EvaluationSchema)
+    checkpoint: CheckpointSchema = field(default_factory=CheckpointSchema)
+    output_root: str = MISSING
+    resume: str | None = MISSING
+    resume_override: bool = MISSING
+    allowed_targets: list[str] = field(default_factory=list)
+
+
+ConfigStore.instance().store(name="schema", node=Schema)
+
+
+class RunError(RuntimeError):
+    """A training that could not go on, in words for its user."""
+
+
+class SettingsError(ValueError):
+    """A setting that breaks its rule, found before any work is done."""
+
+
+def check(config: DictConfig) -> None:
+    """Refuses keys that nothing reads and numbers that would fail only in the middle of a run."""
+    for section, schema in (
+        (config, Schema),
+        (config.evaluation, EvaluationSchema),
+        (config.checkpoint, CheckpointSchema),
+    ):
+        if unknown := set(section) - {known.name for known in fields(schema)}:  # added with +
+            raise SettingsError(
+                f"{min(unknown)} must be a known setting; `python train.py --cfg job` shows all of them."
+            )
+    for key, least in (
+        ("total_frames", 1),
+        ("threads", 1),
+        ("steps_per_batch", 2),  # TorchRL's two-dimensional storage can't take single steps
+        ("log_frames", 1),
+        ("evaluation.num_envs", 1),
+        ("evaluation.episodes", 1),
+        ("evaluation.interval_frames", 1),
+        ("evaluation.final_episodes", 1),
+        ("checkpoint.interval_frames", 1),
+        ("checkpoint.keep_last", 2),  # so that there is one while the newest is being replaced
+    ):
+        value = OmegaConf.select(config, key)
+        if value < least:
+            raise SettingsError(f"{key} must be >= {least}, got {value}; leave it out for the default.")
+    if config.checkpoint.interval_minutes <= 0:
+        raise SettingsError(
+            f"checkpoint.interval_minutes must be > 0, got {config.checkpoint.interval_minutes}; use 10."
+        )
+    if config.device not in ("auto", "cpu", "cuda"):
+        raise SettingsError(
+            f"device must be auto, cpu or cuda, got {config.device!r}; auto takes a GPU if there is one."
+        )
+    check_targets(config, config.allowed_targets)
+
+
+def check_targets(config: DictConfig, allowed: list[str]) -> None:
+    """Refuses every ``_target_`` outside the allow-list. Runs before anything is built.
+
+    Args:
+        config: settings that will be instantiated.
+        allowed: names allowed beside :data:`ALLOWED_TARGETS`; never read from the run folder itself.
+    """
+    for path, target in _targets(config):
+        if target not in ALLOWED_TARGETS and target not in allowed:
+            raise SettingsError(
+                f"{path} must be one of the builders that this program trusts, got {target!r}. If you wrote this "
+                f"setting and trust it, add 'allowed_targets=[{target}]' to the command."
+            )
+
+
+def _targets(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every ``_target_`` in a configuration, with its full name."""
+    if isinstance(node, DictConfig):
+        for key in node:
+            name = f"{path}.{key}" if path else str(key)
+            if key == "_target_":
+                yield name, node[key]
+            else:
+                yield from _targets(node[key], name)
+    elif isinstance(node, ListConfig):
+        for index, item in enumerate(node):
+            yield from _targets(item, f"{path}[{index}]")
+
+
+def build_algorithm(config: DictConfig, **env_changes) -> tuple[EnvBase, Algorithm]:
+    """The bare environment and the algorithm of a configuration."""
+    env = instantiate(config.env, **env_changes)
+    return env, instantiate(config.algo, env, instantiate(config.network))
+
+
+def pick_device(name: str, has_cuda: bool) -> str:
+    """``auto`` is the GPU where there is one."""
+    if name == "cuda" and not has_cuda:
+        raise SettingsError(
+            "device must be cpu or auto on a machine without a usable GPU, got 'cuda'; use device=auto."
+        )
+    return ("cuda" if has_cuda else "cpu") if name == "auto" else name
+
+
+def explain(error: Exception) -> str:
+    """The cause of a failed instantiation, with the full name of the setting in front."""
+    if not isinstance(error, InstantiationException):
+        return str(error)
+    path = str(error).rpartition("full_key: ")[2].strip() if "full_key: " in str(error) else ""
+    cause = error.__cause__
+    if isinstance(cause, ValueError):
+        return f"{path}.{cause}" if path else str(cause)
+    return f"{path}: {cause or error}; `python train.py --cfg job` shows every setting and its default."
+
+
+def read_config(folder: Path) -> DictConfig:
+    """``config.yaml`` of a run folder. Nothing in it is trusted: see :func:`check_targets`."""
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise SettingsError(
+            f"run must be a folder that train.py wrote, got {folder}, which has no config.yaml; "
+            "the default place of runs is outputs/."
+        )
+    try:
+        stored = OmegaConf.load(path)
+        config = OmegaConf.merge(OmegaConf.structured(Schema), stored)
+        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise SettingsError(f"{path} can't be read as the settings of a run: {reason}") from error
+    assert isinstance(config, DictConfig)
+    return config
+
+
+def read_choices(folder: Path) -> dict[str, str]:
+    """Which file of each group of conf/ a run was composed of (``{"env": "gridworld", "algo": "v2", ...}``)."""
+    try:
+        choices = json.loads((folder / "run.json").read_text())["choices"]
+        return {str(group): str(choice) for group, choice in choices.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}  # it is for headings and comparisons only
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained agent read back from its run folder."""
+
+    config: DictConfig
+    env: EnvBase
+    """Transformed environment with batch size ``[num_envs]``."""
+    algorithm: Algorithm
+
+
+def load_agent(
+    run: str | Path,
+    *,
+    checkpoint: str = "best",
+    num_envs: int = 1,
+    env_changes: dict[str, Any] | None = None,
+    allowed_targets: list[str] | None = None,
+) -> Agent:
+    """Builds a run's agent on its task and loads its weights.
+
+    Args:
+        run: run folder.
+        checkpoint: ``"best"``, ``"last"``, or the path of a checkpoint or weights file.
+        num_envs: number of worlds of the environment.
+        env_changes: settings of the environment that shall differ from the run's.
+        allowed_targets: see :func:`check_targets`.
+
+    Raises:
+        SettingsError: if the folder is not a run, names something that may not be built, or its weights do not fit.
+    """
+    from hdrqn_torchrl.checkpoint import load_policy
+
+    folder = Path(run)
+    config = read_config(folder)
+    check_targets(config, allowed_targets or [])
+    for key, value in (env_changes or {}).items():
+        if key.startswith("_") or key not in config.env:
+            raise SettingsError(f"env.{key} must be one of {sorted(set(config.env) - {'_target_'})}; it is none.")
+        config.env[key] = value
+    try:
+        env, algorithm = build_algorithm(config, num_envs=num_envs, device="cpu")
+        load_policy(algorithm.policy, folder / "checkpoints", checkpoint)
+    except (InstantiationException, ValueError) as error:
+        raise SettingsError(explain(error)) from error
+    return Agent(config, algorithm.transform(env), algorithm)
+
+
+def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
+    """Calls ``run`` with an instance of ``schema`` filled from ``key=value`` arguments; ends with a message if wrong.
+
+    Args:
+        schema: dataclass of the settings; ``MISSING`` marks those that must be given.
+        doc: what ``--help`` prints.
+        run: does the work.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments) or not arguments:
+        print(doc.strip())
+        sys.exit(0 if arguments else 2)
+    try:
+        if wrong := [argument for argument in arguments if "=" not in argument]:
+            raise SettingsError(f"an argument must read key=value, got {wrong[0]!r}; --help shows all of them.")
+        try:
+            settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.from_dotlist(arguments))
+        except OmegaConfBaseException as error:
+            known = ", ".join(each.name for each in fields(schema))
+            raise SettingsError(f"{str(error).splitlines()[0]}; the settings are {known}.") from error
+        if missing := OmegaConf.missing_keys(settings):
+            raise SettingsError(f"{min(missing)} must be given: {min(missing)}=...; --help shows all settings.")
+        run(OmegaConf.to_object(settings))
+    except SettingsError as error:
+        sys.exit(f"error: {error}")

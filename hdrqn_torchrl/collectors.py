@@ -1,0 +1,56 @@
+"""A collector that goes on in mid-episode after a restart."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torchrl.collectors import Collector
+
+
+class ResumableCollector(Collector):
+    """TorchRL's ``Collector`` whose state includes the environment and the step that it is about to take.
+
+    TorchRL's own leaves both out and starts new episodes when it is loaded: recurrent states, options in
+    progress and the worlds themselves would be lost. The environment must return its state, its random generator
+    included, from ``state_dict`` and take it back with ``load_state_dict``.
+
+    Raises:
+        ValueError: if the environment keeps its state to itself.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> collector = ResumableCollector(MultiGoalGridEnv(num_envs=2), frames_per_batch=8, total_frames=64)
+        >>> batches = iter(collector)
+        >>> _ = next(batches)
+        >>> state, following = collector.state_dict(), next(batches)["observation"].clone()
+        >>> collector.load_state_dict(state)
+        >>> collector.env.base_env.steps.tolist()
+        [4, 4]
+    """
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        if not self._base_env.state_dict():
+            raise ValueError(
+                f"the environment must return its state from state_dict(), got nothing from {type(self._base_env)}; "
+                "implement state_dict and load_state_dict, or use torchrl.collectors.Collector without checkpoints."
+            )
+
+    @property
+    def _base_env(self):  # noqa: ANN202
+        return getattr(self.env, "base_env", self.env)
+
+    def state_dict(self) -> dict[str, Any]:
+        """TorchRL's state without the policy, which has a checkpoint entry of its own, and with what it lacks."""
+        state = super().state_dict()
+        state.pop("policy_state_dict", None)
+        return {**state, "base_env": self._base_env.state_dict(), "carrier": self._carrier.exclude("next").clone()}
+
+    def load_state_dict(self, state_dict: dict[str, Any], **kwargs) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        super().load_state_dict(state_dict, strict=False)
+        self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL numbered the episodes anew
+        self._base_env.load_state_dict(state_dict["base_env"])
+        self._carrier = state_dict["carrier"].clone()
+        if self._carrier_has_no_device:
+            self._carrier.clear_device_()
