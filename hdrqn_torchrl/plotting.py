@@ -1,17 +1,16 @@
-"""Learning curves of a run against the ceiling of its task."""
+"""The curves of one run against the ceiling of its task."""
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-Metrics = dict[str, list[float]]
-References = dict[str, dict[str, float]]
+from hdrqn_torchrl.results import Metrics, References, read_metrics
+
+__all__ = ["plot_run", "read_metrics"]
 
 _PANELS = (
     ("return", "total reward of an episode"),
@@ -19,14 +18,6 @@ _PANELS = (
     ("extrinsic", "extrinsic reward of an episode"),
     ("steps", "steps of an episode"),
 )
-
-
-def read_metrics(path: Path) -> Metrics:
-    """Columns of a ``metrics.csv``; an empty cell is NaN."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = list(rows[0]) if rows else []
-    return {name: [float(row[name] or "nan") for row in rows] for name in names}
 
 
 def plot_run(
@@ -39,7 +30,7 @@ def plot_run(
     """Draws the paper's four curves (reward, intrinsic, extrinsic, steps) of one run over environment frames.
 
     Args:
-        metrics: columns as :func:`read_metrics` returns them.
+        metrics: columns as :func:`~hdrqn_torchrl.results.read_metrics` returns them.
         path: picture to write; its ending chooses the format.
         title: heading.
         references: scripted players by name, each with ``return_mean`` and ``steps_mean``, drawn as dashed lines.
@@ -55,39 +46,6 @@ def plot_run(
         axis.grid(alpha=0.3)
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="lower right")
-    figure.suptitle(title)
-    figure.savefig(path, dpi=110)
-
-
-def plot_comparison(
-    runs: dict[str, list[Metrics]], path: Path, *, title: str = "", references: References | None = None
-) -> None:
-    """Draws greedy return and success of several algorithms over environment frames: mean and range over their runs.
-
-    Args:
-        runs: metrics of the runs (one per seed) of each algorithm, by label. The runs of one label share their
-            evaluation frames; frames that only some of them have reached are left out.
-        path: picture to write; its ending chooses the format.
-        title: heading.
-        references: scripted players by name, with ``return_mean`` and ``success_rate``, drawn as dashed lines.
-    """
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    axes = figure.subplots(1, 2)
-    panels = (("greedy/return", "return_mean", "return"), ("greedy/success", "success_rate", "all goals in order"))
-    for axis, (column, reference, label) in zip(axes, panels, strict=True):
-        for name, seeds in runs.items():
-            points = [dict(zip(run["frames"], run[column], strict=True)) for run in seeds]
-            frames = [x for x in seeds[0]["frames"] if all(not np.isnan(run.get(x, np.nan)) for run in points)]
-            values = np.array([[run[x] for x in frames] for run in points])
-            axis.plot(
-                frames, values.mean(0), marker=".", label=f"{name} ({len(seeds)} seed{'s' if len(seeds) > 1 else ''})"
-            )
-            axis.fill_between(frames, values.min(0), values.max(0), alpha=0.2)
-        _reference_lines(axis, references or {}, reference)
-        axis.set(xlabel="environment frames", title=f"greedy evaluation: {label}")
-        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axis.grid(alpha=0.3)
-    axes[1].legend(loc="lower right")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)
 

@@ -8,8 +8,8 @@ import pytest
 import hdrqn_torchrl
 
 ORDER = (
-    "keys", "envs", "transforms", "modules", "objectives", "data", "learner", "algorithms", "evaluation", "checkpoint",
-    "logging", "plotting", "trainer", "run_folder",
+    "keys", "envs", "transforms", "modules", "objectives", "data", "collectors", "learner", "algorithms", "evaluation",
+    "checkpoint", "interruption", "logging", "results", "plotting", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

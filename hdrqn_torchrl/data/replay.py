@@ -70,7 +70,7 @@ class SequenceStorage(LazyTensorStorage):
     """
 
     def state_dict(self) -> dict[str, Any]:
-        if not self.initialized:
+        if self._storage is None:
             return {"stored": None}
         stored = self[:]  # the part that was written
         return {"stored": stored, "rows": len(self._storage), "last_cursor": self._last_cursor_index}
