@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -24,9 +27,14 @@ class EpisodeTracker:
     Reported per episode: ``return``, ``extrinsic``, ``intrinsic`` (hierarchical agents), ``success`` (1 if the whole
     task was completed), ``in_order`` (share of subgoals reached in the proper order, i.e. with an extrinsic
     reward of at least 1) and ``steps``.
+
+    Args:
+        per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
+            attained, options for it that ended, and those of them that reached it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, per_subgoal: bool = False) -> None:
+        self.per_subgoal = per_subgoal
         self.sums: TensorDictBase | None = None  # [N]
 
     def add(self, after: TensorDictBase) -> TensorDictBase:
@@ -38,10 +46,12 @@ class EpisodeTracker:
         step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after}
         step["in_order"] = (step["extrinsic"] >= 1.0).float() / after.get(keys.ATTAINED).shape[-1]
         step["steps"] = torch.ones_like(step["return"])
+        if self.per_subgoal:
+            step |= _subgoal_events(after)
         sums = TensorDict(step, after.batch_size, device=after.device)
         if self.sums is not None:
             sums = sums + self.sums
-        self.sums = sums * (~after.get(keys.DONE)).squeeze(-1).float()
+        self.sums = sums.clone().masked_fill_(after.get(keys.DONE).squeeze(-1), 0.0)
         return sums
 
     def finished(self, batch: TensorDictBase) -> TensorDictBase:
@@ -60,16 +70,29 @@ class EpisodeTracker:
         self.sums = state["sums"]
 
 
+def _subgoal_events(after: TensorDictBase) -> dict[str, Tensor]:
+    """What happened to each subgoal in one step, ``[N, G]`` each."""
+    attained = after.get(keys.ATTAINED).float()
+    if keys.OPTION_DONE not in after:
+        return {"attained": attained}
+    active = torch.nn.functional.one_hot(after.get(keys.ACTIVE_SUBGOAL), attained.shape[-1]).float()
+    return {
+        "attained": attained,
+        "chosen": active * after.get(keys.OPTION_DONE),
+        "reached": active * after.get(keys.SUBGOAL_REACHED),
+    }
+
+
 @torch.no_grad()
-def evaluate(
+def play(
     env: EnvBase,
     policy: TensorDictModuleBase,
     *,
     episodes: int,
     seed: int = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
-) -> dict[str, float]:
-    """Plays ``episodes`` episodes and averages them; the same seed gives the same episodes.
+) -> TensorDictBase:
+    """Plays episodes; the same seed gives the same ones.
 
     Every environment contributes the same number of episodes: taking the first that finish would favour short
     ones. (TorchRL's ``Evaluator`` does that, hence this function.)
@@ -82,29 +105,88 @@ def evaluate(
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
 
     Returns:
-        ``return_mean``, ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete
-        the whole task), ``in_order_rate`` (share of subgoals reached in the proper
-        order), ``steps_mean``, ``episodes``.
+        One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)``.
     """
     env.set_seed(seed)
     with set_exploration_type(exploration_type), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         rounds = [_play_once(env, policy) for _ in range(-(-episodes // env.batch_size[0]))]
-    played: TensorDictBase = torch.cat(rounds, 0)  # type: ignore[assignment]
+    return torch.cat(rounds, 0)  # type: ignore[return-value]
+
+
+def evaluate(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    episodes: int,
+    seed: int = 0,
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+) -> dict[str, float]:
+    """Plays episodes and averages them; arguments as in :func:`play`.
+
+    Returns:
+        ``return_mean``, ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete
+        the whole task), ``in_order_rate`` (share of subgoals reached in the proper
+        order), ``steps_mean``, ``episodes``.
+    """
+    played = play(env, policy, episodes=episodes, seed=seed, exploration_type=exploration_type)
+    return {**{name: _mean(values) for name, values in columns(played).items()}, "episodes": len(played)}
+
+
+def columns(played: TensorDictBase) -> dict[str, Tensor]:
+    """The figures that a result consists of, one value per episode ``[M]`` each."""
     return {
-        "return_mean": _mean(played["return"]),
-        "extrinsic_mean": _mean(played["extrinsic"]),
-        "intrinsic_mean": _mean(played["intrinsic"]) if "intrinsic" in played else 0.0,
-        "success_rate": _mean(played["success"]),
-        "in_order_rate": _mean(played["in_order"]),
-        "steps_mean": _mean(played["steps"]),
-        "episodes": len(played),
+        "return_mean": played["return"],
+        "extrinsic_mean": played["extrinsic"],
+        "intrinsic_mean": played["intrinsic"] if "intrinsic" in played else torch.zeros_like(played["return"]),
+        "success_rate": played["success"],
+        "in_order_rate": played["in_order"],
+        "steps_mean": played["steps"],
     }
+
+
+def summarise(played: TensorDictBase, *, confidence: float = 0.95) -> dict[str, Any]:
+    """Averages with bootstrap intervals, and what became of each subgoal.
+
+    Args:
+        played: episodes of :func:`play`.
+        confidence: of the intervals.
+
+    Returns:
+        The entries of :func:`evaluate`; ``intervals``: the same names with ``[low, high]``; ``per_subgoal``: for each
+        subgoal ``attained`` (share of episodes in which it was) and, for hierarchical agents, ``options`` (per
+        episode) and ``success_rate`` (share of its options that reached it; ``None`` if it was never chosen).
+    """
+    figures = columns(played)
+    result: dict[str, Any] = {name: _mean(values) for name, values in figures.items()}
+    result |= {"episodes": len(played), "per_subgoal": []}
+    for subgoal in range(played["attained"].shape[-1]):
+        entry = {"attained": _mean((played["attained"][:, subgoal] > 0).float())}
+        if "chosen" in played:
+            options = played["chosen"][:, subgoal].sum().item()
+            reached = played["reached"][:, subgoal].sum().item()
+            entry |= {"options": options / len(played), "success_rate": reached / options if options else None}
+        result["per_subgoal"].append(entry)
+    result["intervals"] = {name: _interval(values, confidence) for name, values in figures.items()}
+    return result
+
+
+def _interval(values: Tensor, confidence: float) -> list[float]:
+    """Percentile bootstrap interval of the mean over episodes; the random numbers are fixed."""
+    from scipy.stats import bootstrap  # loading it takes a second; only summaries need it
+
+    sample = values.cpu().double().numpy()
+    if len(sample) < 2:
+        return [sample.mean().item()] * 2
+    result = bootstrap(
+        (sample,), numpy.mean, n_resamples=2_000, confidence_level=confidence, method="percentile", rng=0
+    )
+    return [result.confidence_interval.low.item(), result.confidence_interval.high.item()]
 
 
 def _play_once(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
     """One episode in each environment, ``[N]``."""
-    tensordict, tracker = env.reset(), EpisodeTracker()
+    tensordict, tracker = env.reset(), EpisodeTracker(per_subgoal=True)
     playing = torch.ones(env.batch_size, dtype=torch.bool, device=tensordict.device)
     episodes: TensorDictBase | None = None
     while playing.any():

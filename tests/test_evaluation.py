@@ -1,10 +1,10 @@
 import pytest
 import torch
-from helpers import RIGHT, build, collect, small_env
+from helpers import RIGHT, build, collect, small_env, subgoal_env
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from hdrqn_torchrl.evaluation import EpisodeTracker, evaluate
+from hdrqn_torchrl.evaluation import EpisodeTracker, evaluate, play, summarise
 
 PAIR = ("####", "#  #", "####")  # agent and goal side by side
 TRACKED = ("return", "extrinsic", "intrinsic", "success", "in_order", "steps")
@@ -129,3 +129,46 @@ class TestEpisodeTracker:
         env = small_env(5)
         finished = EpisodeTracker().finished(collect(build("drqn", env), env, 10)[0])
         assert set(finished.keys()) == set(TRACKED) - {"intrinsic"}
+
+
+class TestPerSubgoal:
+    def test_goals_of_a_scripted_walk(self):
+        """In a row of three cells, going right from its left end takes both goals."""
+        env = subgoal_env(1, env_settings={"layout": ("#####", "#   #", "#####"), "num_obstacles": 0, "max_steps": 2})
+        chosen = torch.tensor([0])
+        policy = TensorDictModule(
+            lambda observation: (torch.full(observation.shape[:1], RIGHT), chosen),
+            ["observation"],
+            ["action", "subgoal"],
+        )
+        played = [play(env, policy, episodes=1, seed=seed) for seed in range(40)]
+        in_order = [each for each in played if each["steps"] == 2 and each["in_order"] == 1]
+        assert in_order
+        for each in in_order:  # the first option reaches goal 0; the second, for the goal that is gone, ends in vain
+            assert each["attained"].tolist() == [[1.0, 1.0]]
+            assert each["chosen"].tolist() == [[2.0, 0.0]] and each["reached"].tolist() == [[1.0, 0.0]]
+        summary = summarise(in_order[0])
+        assert summary["per_subgoal"] == [
+            {"attained": 1.0, "options": 2.0, "success_rate": 0.5},
+            {"attained": 1.0, "options": 0.0, "success_rate": None},
+        ]
+
+    def test_flat_agents_have_no_options(self):
+        played = play(pair_env(4), always_right(), episodes=4)
+        assert set(summarise(played)["per_subgoal"][0]) == {"attained"}
+
+
+class TestIntervals:
+    def test_more_episodes_narrow_them_around_the_mean(self):
+        def width(episodes):
+            summary = summarise(play(pair_env(50), always_right(), episodes=episodes, seed=1))
+            low, high = summary["intervals"]["return_mean"]
+            assert low < summary["return_mean"] < high
+            return high - low
+
+        assert width(50) == pytest.approx(4 * 0.5 / 50**0.5, rel=0.3)  # 1.96 standard errors of a coin, twice
+        assert width(800) == pytest.approx(width(50) / 4, rel=0.3)
+
+    def test_constant_figures_have_a_point(self):
+        summary = summarise(play(pair_env(4), always_right(), episodes=4))
+        assert summary["intervals"]["intrinsic_mean"] == [0.0, 0.0]
