@@ -1,4 +1,4 @@
-"""DQN, DRQN, hDQN, hDRQNv1 and hDRQNv2 as pure builders over the same parts.
+"""DQN, DRQN, hDQN, hDRQNv1, hDRQNv2 and hDRQNv3 as pure builders over the same parts.
 
 A builder reads the specs of a bare environment and returns an :class:`Algorithm`: a policy, one learner per
 level, and the transforms that the environment needs. The training loop never asks which one it runs.
@@ -20,8 +20,30 @@ from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector, refresh_hidden
 from hdrqn_torchrl.learner import Learner, LearnerSettings
-from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.modules import (
+    AllSubgoalsNetwork,
+    AllSubgoalsPolicy,
+    Architecture,
+    EpsilonGreedy,
+    HierarchicalPolicy,
+    MetaController,
+    RepeatingEpsilonGreedy,
+    SubController,
+)
+from hdrqn_torchrl.objectives import AllSubgoalsLoss
 from hdrqn_torchrl.transforms import SubgoalTransform
+
+V3_LEARNER = LearnerSettings(
+    slice_len=50,
+    capacity=200_000,
+    frames_per_update=20,
+    warmup_frames=10_000,
+    learning_rate=6e-4,
+    tau=0.005,
+    max_grad_norm=10.0,
+    sampling="episode_starts",
+)
+"""Defaults of :func:`make_v3`, for episodes of 50 steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,6 +254,108 @@ def make_hdrqn(
 
 make_hdqn = partial(make_hdrqn, version="v1", recurrent=False)
 """Two levels without memory (h-DQN; Kulkarni et al., 2016); see :func:`make_hdrqn`."""
+
+
+def make_v3(
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    learner: LearnerSettings = V3_LEARNER,
+    sub_exploration: EpsilonGreedy | None = None,
+    meta_exploration: EpsilonGreedy | None = None,
+    memory_size: int = 128,
+    head_size: int = 128,
+    joint: bool = True,
+    sub_gamma: float = 0.95,
+    meta_gamma: float = 0.97,
+    trace_decay: float = 0.8,
+    all_subgoals: bool = True,
+    intra_option: bool = True,
+    wrong_subgoal_reward: float = -0.5,
+    hazard_reward: float = -1.0,
+    max_option_steps: int | None = None,
+    max_meta_target: float | None = None,
+) -> Algorithm:
+    """hDRQNv3, this project's own agent: one memory for the whole episode, all subgoals learn from every step.
+
+    Args:
+        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        architecture: where the features come from.
+        learner: how it learns; ``sampling`` must be ``"episode_starts"``, ``slice_len`` should cover an episode.
+        sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
+        memory_size: H, size of the LSTM.
+        head_size: units of the heads' hidden layers.
+        joint: whether the meta level trains the memory, too.
+        sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, wrong_subgoal_reward, hazard_reward,
+            max_meta_target: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        max_option_steps: step limit of an option.
+
+    Raises:
+        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
+        ['joint']
+    """
+    if learner.sampling != "episode_starts":
+        raise ValueError(
+            f"sampling must be 'episode_starts' for v3, got {learner.sampling!r}: its memory lasts a whole episode and "
+            "would start empty in the middle of one."
+        )
+    num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
+    network = AllSubgoalsNetwork(
+        architecture.observation_features(env.observation_spec[keys.OBSERVATION]),
+        num_actions=env.action_spec.n,
+        num_subgoals=num_subgoals,
+        hidden_size=memory_size,
+        head_size=head_size,
+        joint=joint,
+    )
+    sub_exploration, meta_exploration = sub_exploration or RepeatingEpsilonGreedy(), meta_exploration or EpsilonGreedy()
+    policy = AllSubgoalsPolicy(network, sub_exploration, meta_exploration).to(env.device)
+    loss = AllSubgoalsLoss(
+        policy,
+        sub_gamma=sub_gamma,
+        meta_gamma=meta_gamma,
+        trace_decay=trace_decay,
+        wrong_subgoal_reward=wrong_subgoal_reward,
+        hazard_reward=hazard_reward,
+        double=learner.double,
+        all_subgoals=all_subgoals,
+        intra_option=intra_option,
+        max_meta_target=max_meta_target,
+    )
+    stored = StepSelector(
+        root_keys=[
+            keys.OBSERVATION,
+            keys.PREVIOUS_ACTION,
+            keys.ACTION,
+            keys.IS_INIT,
+            keys.OPTION_INIT,
+            keys.SUBGOAL_MASK,
+        ],
+        next_keys=[keys.ATTAINED, keys.HAZARD, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
+    )
+    trained = Learner(policy, learner, extract=stored, loss=loss, lookahead=1, num_envs=env.batch_size[0])
+
+    def make_transforms() -> Compose:
+        subgoals = SubgoalTransform(
+            num_subgoals,
+            gamma=meta_gamma,
+            max_option_steps=max_option_steps,
+            hazard_reward=hazard_reward,
+            wrong_subgoal_reward=wrong_subgoal_reward,
+        )
+        return Compose(InitTracker(), subgoals, policy.make_tensordict_primer())
+
+    return Algorithm(
+        policy=policy,
+        learners={"joint": trained},
+        explorations={"sub": sub_exploration, "meta": meta_exploration},
+        make_transforms=make_transforms,
+    )
 
 
 @torch.no_grad()

@@ -161,7 +161,7 @@ def summarise(played: TensorDictBase, *, confidence: float = 0.95) -> dict[str, 
     result: dict[str, Any] = {name: _mean(values) for name, values in figures.items()}
     result |= {"episodes": len(played), "per_subgoal": []}
     for subgoal in range(played["attained"].shape[-1]):
-        entry = {"attained": _mean((played["attained"][:, subgoal] > 0).float())}
+        entry: dict[str, float | None] = {"attained": _mean((played["attained"][:, subgoal] > 0).float())}
         if "chosen" in played:
             options = played["chosen"][:, subgoal].sum().item()
             reached = played["reached"][:, subgoal].sum().item()

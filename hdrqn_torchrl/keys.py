@@ -18,8 +18,12 @@ IS_INIT = "is_init"  # [1] bool: first step of an episode
 # Written by the policy.
 ACTION = "action"  # [] int64
 SUBGOAL = "subgoal"  # [] int64: the meta-controller's proposal, honoured where OPTION_INIT
-ACTION_VALUE = "action_value"  # [A] float32: Q-values
+ACTION_VALUE = "action_value"  # [A] float32: Q-values; [G, A] where every subgoal has its own
+SUBGOAL_VALUE = "subgoal_value"  # [G] float32: Q-values of the meta level where one module has both
 SUB_HIDDEN, SUB_CELL = "sub_hidden", "sub_cell"  # [H] float32: h^S
+MEMORY_HIDDEN, MEMORY_CELL = "memory_hidden", "memory_cell"  # [H] float32: v3's memory of the whole episode
+PREVIOUS_ACTION = "previous_action"  # [] int64: action of the step before; meaningless at the first step
+REPEATED_ACTION = "repeated_action"  # [2] int64: exploratory action in progress, and for how many more steps
 META_HIDDEN, META_CELL = "meta_hidden", "meta_cell"  # [H] float32: h^M
 
 # Written by SubgoalTransform.

@@ -10,9 +10,9 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.objectives import SoftUpdate
+from torchrl.objectives import LossModule, SoftUpdate
 
-from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data import Sampling, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
 
 
@@ -50,8 +50,7 @@ class LearnerSettings:
         burn_in: share of a sequence left out of the loss at its beginning.
         train_exact_states: train leading steps whose recurrent state is exact (see
             :func:`~hdrqn_torchrl.objectives.training_mask`).
-        sampling: how sequences are drawn, ``"steps"`` or ``"episodes"`` (see
-            :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
+        sampling: how sequences are drawn (see :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be, if known; targets are cut off above it.
@@ -72,7 +71,7 @@ class LearnerSettings:
     max_grad_norm: float | None = None
     burn_in: float = 0.5
     train_exact_states: bool = True
-    sampling: Literal["steps", "episodes"] = "steps"
+    sampling: Sampling = "steps"
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
     max_target: float | None = None
@@ -108,7 +107,9 @@ class Learner:
         settings: how it learns.
         extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet; with
             ``state_dict`` and ``load_state_dict``.
-        loss_keys: keys of the loss, as in :meth:`RecurrentDQNLoss.set_keys`.
+        loss_keys: keys of a :class:`RecurrentDQNLoss` that is built from ``settings``; or
+        loss: a built loss that writes ``"loss"``.
+        lookahead: steps that a minibatch's sequences have beyond ``slice_len``.
         gamma: discount of one environment step.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
         refresh: applied to every minibatch before it is learned from.
@@ -125,29 +126,23 @@ class Learner:
         settings: LearnerSettings,
         *,
         extract: Extract,
-        loss_keys: dict[str, NestedKey | None],
+        loss_keys: dict[str, NestedKey | None] | None = None,
+        loss: LossModule | None = None,
+        lookahead: int = 0,
         gamma: float = 0.99,
         num_envs: int | None = None,
         refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
         self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
-        self.loss = RecurrentDQNLoss(
-            network,
-            gamma=gamma,
-            burn_in=settings.burn_in,
-            train_exact_states=settings.train_exact_states,
-            loss_function=settings.loss_function,
-            double=settings.double,
-            max_target=settings.max_target,
-        )
-        self.loss.set_keys(**loss_keys)
+        self.loss = _recurrent_loss(network, settings, gamma, loss_keys or {}) if loss is None else loss
         self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
         self._parameters = list(network.parameters())
         self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, fused=True)
+        self._sequence_len = settings.slice_len + lookahead
         self.buffer = make_sequence_buffer(
             settings.capacity,
-            slice_len=settings.slice_len,
+            slice_len=self._sequence_len,
             batch_size=settings.batch_size * samples_per_draw,
             num_envs=num_envs,
             sampling=settings.sampling,
@@ -184,7 +179,7 @@ class Learner:
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len]``."""
         if not self._drawn:
-            sequences = sample_sequences(self.buffer, self.settings.slice_len)
+            sequences = sample_sequences(self.buffer, self._sequence_len)
             self._drawn = list(sequences.split(self.settings.batch_size, 0))
         sample = self._drawn.pop()
         return sample if self.refresh is None else self.refresh(sample)
@@ -245,3 +240,19 @@ class Learner:
         self.extract.load_state_dict(state["extract"])
         self._drawn = list(state["drawn"])
         self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
+
+
+def _recurrent_loss(
+    network: TensorDictModuleBase, settings: LearnerSettings, gamma: float, loss_keys: dict[str, NestedKey | None]
+) -> RecurrentDQNLoss:
+    loss = RecurrentDQNLoss(
+        network,
+        gamma=gamma,
+        burn_in=settings.burn_in,
+        train_exact_states=settings.train_exact_states,
+        loss_function=settings.loss_function,
+        double=settings.double,
+        max_target=settings.max_target,
+    )
+    loss.set_keys(**loss_keys)
+    return loss

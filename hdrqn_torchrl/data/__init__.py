@@ -2,11 +2,19 @@
 
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
-from hdrqn_torchrl.data.replay import StepSliceSampler, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data.replay import (
+    EpisodeStartSampler,
+    Sampling,
+    StepSliceSampler,
+    make_sequence_buffer,
+    sample_sequences,
+)
 
 __all__ = [
+    "EpisodeStartSampler",
     "OptionExtractor",
     "OptionHistory",
+    "Sampling",
     "StepSelector",
     "StepSliceSampler",
     "make_sequence_buffer",

@@ -11,7 +11,7 @@ from torchrl.data import LazyTensorStorage, SliceSampler, Storage, TensorDictRep
 
 from hdrqn_torchrl import keys
 
-Sampling = Literal["steps", "episodes"]
+Sampling = Literal["steps", "episodes", "episode_starts"]
 
 
 class StepSliceSampler(SliceSampler):
@@ -63,6 +63,46 @@ class StepSliceSampler(SliceSampler):
         return tuple(index), {keys.PAD_MASK: mask.flatten()}
 
 
+class EpisodeStartSampler(SliceSampler):
+    """Slices that start where a random episode starts, and run on into the next ones if it is shorter.
+
+    The recurrent state of every step is exact, no step is padding, and whether a step is shown depends on its past only
+    (see :class:`StepSliceSampler`). Needs a storage of two dimensions (time, environment).
+
+    Args:
+        slice_len: steps of a slice; an episode's later steps are never shown.
+        init_key: first step of an episode.
+        traj_key: entry that numbers the episodes.
+    """
+
+    def __init__(
+        self, *, slice_len: int, init_key: NestedKey = keys.IS_INIT, traj_key: NestedKey = keys.TRAJ_IDS
+    ) -> None:
+        super().__init__(slice_len=slice_len, traj_key=traj_key, truncated_key=None, init_key=None, cache_values=True)
+        self.first_key = init_key
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
+        length, count = self._adjusted_batch_size(batch_size)
+        if "starts" not in self._cache:
+            self._cache["starts"] = self._find_starts(storage, length)
+        time, environment = self._cache["starts"]
+        if not len(time):
+            raise RuntimeError(
+                f"no episode is followed by slice_len={length} stored steps yet; update later or use shorter slices."
+            )
+        chosen = torch.randint(len(time), (count,), device=time.device, generator=self._rng)
+        times = time[chosen].unsqueeze(-1) + torch.arange(length, device=time.device)
+        return ((times % storage.shape[0]).flatten(), environment[chosen].repeat_interleave(length)), {}
+
+    def _find_starts(self, storage: Storage, length: int) -> tuple[Tensor, Tensor]:
+        """Time and environment of every first step that ``length - 1`` newer steps follow."""
+        init = storage[:].get(self.first_key).squeeze(-1)  # [rows, N]
+        newest = storage._last_cursor_index
+        age = (newest - torch.arange(len(init), device=init.device)) % len(init)
+        return (init & (age >= length - 1).unsqueeze(-1)).nonzero(as_tuple=True)  # type: ignore[return-value]
+
+
 class SequenceStorage(LazyTensorStorage):
     """TorchRL's storage, whose state includes where it was written last.
 
@@ -109,7 +149,8 @@ def make_sequence_buffer(
         num_envs: N if the buffer is extended by collected batches ``[N, T]`` with T >= 2 (steps); ``None`` if by rows
             ``[M]`` that keep each episode together (options).
         sampling: ``"steps"``: every step is equally likely to start a slice (:class:`StepSliceSampler`);
-            ``"episodes"``: a random episode, then a random start in it, as the paper describes it.
+            ``"episodes"``: a random episode, then a random start in it, as the paper describes it;
+            ``"episode_starts"``: from the start of a random episode on (:class:`EpisodeStartSampler`).
         traj_key: entry that numbers the episodes.
         device: device of the storage.
 
@@ -134,6 +175,10 @@ def make_sequence_buffer(
         )
     if sampling == "steps":
         sampler = StepSliceSampler(slice_len=slice_len, traj_key=traj_key)
+    elif sampling == "episode_starts":
+        if num_envs is None:
+            raise ValueError("sampling must be 'steps' or 'episodes' for rows, got 'episode_starts'.")
+        sampler = EpisodeStartSampler(slice_len=slice_len, traj_key=traj_key)
     elif sampling == "episodes":
         sampler = SliceSampler(
             slice_len=slice_len,
@@ -144,7 +189,9 @@ def make_sequence_buffer(
             pad_output=True,
         )
     else:
-        raise ValueError(f"sampling must be 'steps' or 'episodes', got {sampling!r}; the paper's is 'episodes'.")
+        raise ValueError(
+            f"sampling must be 'steps', 'episodes' or 'episode_starts', got {sampling!r}; the paper's is 'episodes'."
+        )
     return TensorDictReplayBuffer(
         storage=SequenceStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
         sampler=sampler,

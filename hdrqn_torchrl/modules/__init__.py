@@ -1,12 +1,15 @@
 """Networks, controllers and exploration as (TensorDict) modules."""
 
+from hdrqn_torchrl.modules.all_subgoals import AllSubgoalsNetwork, AllSubgoalsPolicy
 from hdrqn_torchrl.modules.architectures import Architecture, compact_network, paper_network
 from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
-from hdrqn_torchrl.modules.exploration import EpsilonGreedy
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
 from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
 
 __all__ = [
+    "AllSubgoalsNetwork",
+    "AllSubgoalsPolicy",
     "Architecture",
     "CellFeatures",
     "CellsToImage",
@@ -17,6 +20,7 @@ __all__ = [
     "HierarchicalPolicy",
     "MetaController",
     "QNetwork",
+    "RepeatingEpsilonGreedy",
     "SubController",
     "compact_network",
     "paper_network",

@@ -19,6 +19,7 @@ class EpsilonGreedy(nn.Module):
         start: epsilon at frame 0.
         end: epsilon from ``anneal_frames`` on.
         anneal_frames: length of the schedule in environment frames.
+        ladder: spread of epsilon over the environments, see :meth:`epsilons`; 0: all have the same.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -35,14 +36,18 @@ class EpsilonGreedy(nn.Module):
     frames: Tensor
     epsilon: Tensor
 
-    def __init__(self, start: float = 1.0, end: float = 0.1, *, anneal_frames: int = 100_000) -> None:
+    def __init__(
+        self, start: float = 1.0, end: float = 0.1, *, anneal_frames: int = 100_000, ladder: float = 0.0
+    ) -> None:
         super().__init__()
         for name, value in (("start", start), ("end", end)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be an epsilon in [0, 1], got {value}; the paper goes from 1.0 to 0.1.")
         if anneal_frames < 1:
             raise ValueError(f"anneal_frames must be >= 1, got {anneal_frames}; use start == end for a constant.")
-        self.start, self.end, self.anneal_frames = start, end, anneal_frames
+        if ladder < 0.0:
+            raise ValueError(f"ladder must be >= 0, got {ladder}; 0 gives every environment the same epsilon.")
+        self.start, self.end, self.anneal_frames, self.ladder = start, end, anneal_frames, ladder
         self.register_buffer("frames", torch.zeros((), dtype=torch.int64))
         self.register_buffer("epsilon", torch.tensor(float(start)))
 
@@ -63,11 +68,89 @@ class EpsilonGreedy(nn.Module):
         greedy = action_value.argmax(-1)
         if exploration_type() != ExplorationType.RANDOM:
             return greedy
-        lottery = torch.rand_like(action_value)
-        if mask is not None:
-            lottery = mask_values(lottery, mask)
-        explores = torch.rand(greedy.shape, device=greedy.device) < self.epsilon
-        return torch.where(explores, lottery.argmax(-1), greedy)
+        random = _random_choice(action_value, mask)
+        explores = torch.rand(greedy.shape, device=greedy.device) < self.epsilons(greedy)
+        return torch.where(explores, random, greedy)
+
+    def epsilons(self, like: Tensor) -> Tensor:
+        """Epsilon of each environment, to be broadcast against choices ``[N, *]``.
+
+        With a ladder, environment i has :math:`\\epsilon^{1 + \\alpha i / (N - 1)}` (Ape-X, Horgan et al., 2018).
+        """
+        if not self.ladder or not like.ndim:
+            return self.epsilon
+        rung = torch.linspace(0.0, 1.0, len(like), device=like.device).view(-1, *[1] * (like.ndim - 1))
+        return self.epsilon ** (1.0 + self.ladder * rung)
+
+
+class RepeatingEpsilonGreedy(EpsilonGreedy):
+    r"""Temporally extended epsilon-greedy (Dabney et al., 2021): a random action is kept for some steps.
+
+    Their number n has the probability :math:`P(n) \propto n^{-\mu}`, up to ``max_repeats`` (a zeta distribution, cut).
+    A walk of single random steps rarely leaves its corner; this one does. The policy carries what is in progress.
+
+    Args:
+        start, end, anneal_frames, ladder: as in :class:`EpsilonGreedy`; epsilon is the share of random steps, not of
+            steps at which a random stretch starts.
+        exponent: :math:`\mu`.
+        max_repeats: longest stretch.
+
+    Examples:
+        >>> exploration = RepeatingEpsilonGreedy(1.0, 1.0, max_repeats=1)
+        >>> choice, carried = exploration.extend(torch.zeros(3, 4), torch.zeros(3, 2, dtype=torch.int64))
+        >>> carried[:, 1].tolist()
+        [0, 0, 0]
+    """
+
+    _durations: Tensor
+
+    def __init__(
+        self,
+        start: float = 1.0,
+        end: float = 0.1,
+        *,
+        anneal_frames: int = 100_000,
+        ladder: float = 0.0,
+        exponent: float = 2.0,
+        max_repeats: int = 15,
+    ) -> None:
+        super().__init__(start, end, anneal_frames=anneal_frames, ladder=ladder)
+        if exponent <= 0:
+            raise ValueError(f"exponent must be > 0, got {exponent}; Dabney et al. use 2.")
+        if max_repeats < 1:
+            raise ValueError(f"max_repeats must be >= 1 step, got {max_repeats}; use 15.")
+        durations = torch.arange(1, max_repeats + 1, dtype=torch.float32) ** -exponent
+        self.register_buffer("_durations", durations / durations.sum(), persistent=False)
+        self._mean_duration = (torch.arange(1, max_repeats + 1) * self._durations).sum().item()
+
+    def extend(self, action_value: Tensor, carried: Tensor) -> tuple[Tensor, Tensor]:
+        """Chooses, given the stretch in progress.
+
+        Args:
+            action_value: Q-values ``[*, A]``.
+            carried: random action in progress and the steps that it still lasts, ``[*, 2]`` int64.
+
+        Returns:
+            The choice ``[*]`` int64, and what to carry to the next step.
+        """
+        greedy = action_value.argmax(-1)
+        if exploration_type() != ExplorationType.RANDOM:
+            return greedy, torch.zeros_like(carried)
+        action, left = carried.unbind(-1)
+        share = self.epsilons(greedy)
+        begins = share / (share + (1.0 - share) * self._mean_duration)  # so that `share` of all steps are random
+        begins = (left == 0) & (torch.rand(greedy.shape, device=greedy.device) < begins)
+        durations = torch.multinomial(self._durations, greedy.numel(), replacement=True).view_as(greedy) + 1
+        action = torch.where(begins, _random_choice(action_value, None), action)
+        left = torch.where(begins, durations, left)
+        choice = torch.where(left > 0, action, greedy)
+        return choice, torch.stack([action, (left - 1).clamp(min=0)], -1)
+
+
+def _random_choice(action_value: Tensor, mask: Tensor | None) -> Tensor:
+    """A uniformly random one of the allowed actions, ``[*]``."""
+    lottery = torch.rand_like(action_value)
+    return (lottery if mask is None else mask_values(lottery, mask)).argmax(-1)
 
 
 def mask_values(values: Tensor, mask: Tensor) -> Tensor:

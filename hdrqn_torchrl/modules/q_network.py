@@ -20,9 +20,13 @@ class DuelingHead(nn.Module):
         self.streams = nn.Linear(in_features, 1 + num_actions)
 
     def forward(self, features: Tensor) -> Tensor:
-        streams = self.streams(features)
-        value, advantage = streams[..., :1], streams[..., 1:]
-        return value + advantage - advantage.mean(-1, keepdim=True)
+        return dueling(self.streams(features))
+
+
+def dueling(streams: Tensor) -> Tensor:
+    """Q-values ``[*, A]`` of a value and A advantages, ``[*, 1 + A]``."""
+    value, advantage = streams[..., :1], streams[..., 1:]
+    return value + advantage - advantage.mean(-1, keepdim=True)
 
 
 class QNetwork(nn.Module):

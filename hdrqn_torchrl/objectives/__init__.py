@@ -1,6 +1,23 @@
 """Losses and the pure target functions beneath them."""
 
+from hdrqn_torchrl.objectives.all_subgoals import AllSubgoalsLoss
 from hdrqn_torchrl.objectives.recurrent_dqn import RecurrentDQNLoss
-from hdrqn_torchrl.objectives.targets import double_q_value, smdp_target, training_mask
+from hdrqn_torchrl.objectives.targets import (
+    double_q_value,
+    lambda_returns,
+    n_step_returns,
+    smdp_target,
+    training_mask,
+    watkins_trace,
+)
 
-__all__ = ["RecurrentDQNLoss", "double_q_value", "smdp_target", "training_mask"]
+__all__ = [
+    "AllSubgoalsLoss",
+    "RecurrentDQNLoss",
+    "double_q_value",
+    "lambda_returns",
+    "n_step_returns",
+    "smdp_target",
+    "training_mask",
+    "watkins_trace",
+]

@@ -50,6 +50,86 @@ def smdp_target(
     return reward + (discount * next_value).masked_fill(terminated, 0.0)
 
 
+def lambda_returns(
+    reward: Tensor, ended: Tensor, next_value: Tensor, trace: Tensor, discount: Tensor | float
+) -> Tensor:
+    r"""Q(lambda) targets by a backward recursion:
+    :math:`G_t = r_t + \gamma_t ((1 - \lambda_t) V_{t+1} + \lambda_t G_{t+1})`, and :math:`G_t = r_t` at an end.
+
+    With Watkins' cut (:func:`watkins_trace`) it is Watkins' Q(lambda) (Sutton and Barto, section 12.10); along options,
+    with :math:`\gamma^k` as discount, its SMDP form.
+
+    Args:
+        reward: ``[B, T, *]``.
+        ended: bool; the return ends with this transition, what follows is not read.
+        next_value: value of the state that follows.
+        trace: how much of the next transition's own target is taken over, in [0, 1]. It must be 0 where the next
+            transition does not continue this one; at the last step it is taken to be 0.
+        discount: of what follows, a number or one per transition.
+
+    Examples:
+        >>> reward, nothing = torch.tensor([[0.0, 1.0]]), torch.tensor([[False, False]])
+        >>> lambda_returns(reward, nothing, torch.tensor([[4.0, 8.0]]), torch.tensor([[0.5, 0.5]]), 0.5)
+        tensor([[2.2500, 5.0000]])
+    """
+    discount = torch.as_tensor(discount, device=reward.device).expand_as(reward).masked_fill(ended, 0.0)
+    kept = discount * trace
+    # What does not depend on later targets, for all steps at once.
+    target = reward + (discount - kept) * next_value.masked_fill(ended, 0.0)
+    target[:, -1] = torch.addcmul(target[:, -1], kept[:, -1], next_value[:, -1].masked_fill(ended[:, -1], 0.0))
+    steps = target.unbind(1)
+    for now, following, share in zip(
+        reversed(steps[:-1]), reversed(steps[1:]), reversed(kept.unbind(1)[:-1]), strict=True
+    ):
+        now.addcmul_(share, following)
+    return target
+
+
+def watkins_trace(greedy: Tensor, trace_decay: float) -> Tensor:
+    """Watkins' cut: a target takes over the next one only if the next action is the greedy one.
+
+    Args:
+        greedy: ``[B, T, *]`` bool, whether the action of each step is greedy.
+        trace_decay: lambda.
+
+    Returns:
+        ``[B, T, *]``, the trace of each step for :func:`lambda_returns`: lambda where the next action is greedy.
+
+    Examples:
+        >>> watkins_trace(torch.tensor([[True, False, True]]), 0.5)
+        tensor([[0.0000, 0.5000, 0.0000]])
+    """
+    following = torch.cat([greedy[:, 1:], torch.zeros_like(greedy[:, :1])], 1)
+    return trace_decay * following.float()
+
+
+def n_step_returns(
+    reward: Tensor, ended: Tensor, next_value: Tensor, follows: Tensor, discount: Tensor | float, n: int
+) -> Tensor:
+    r"""n-step targets :math:`r_t + \gamma r_{t+1} + ... + \gamma^n V_{t+n}`, shorter where a sequence ends or breaks.
+
+    Args:
+        reward, ended, next_value, discount: as in :func:`lambda_returns`.
+        follows: bool; whether the next transition continues this one. Where it does not, the value is taken.
+        n: number of rewards, >= 1.
+
+    Examples:
+        >>> reward, no = torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)
+        >>> n_step_returns(reward, no, torch.full((1, 3), 8.0), ~no, 0.5, 2)
+        tensor([[3.5000, 3.5000, 5.0000]])
+    """
+    if n < 1:
+        raise ValueError(f"n must be >= 1 step, got {n}; use 1 for the one-step target.")
+    discount = torch.as_tensor(discount, device=reward.device).expand_as(reward).masked_fill(ended, 0.0)
+    value = next_value.masked_fill(ended, 0.0)
+    shorter = reward + discount * value
+    follows = torch.cat([follows[:, :-1], torch.zeros_like(follows[:, :1])], 1)
+    for _ in range(n - 1):
+        following = torch.cat([shorter[:, 1:], shorter[:, -1:]], 1)
+        shorter = reward + discount * torch.where(follows, following, value)
+    return shorter
+
+
 def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_states: bool) -> Tensor:
     """Which steps of zero-start sequences enter the loss (the paper: the last half).
 

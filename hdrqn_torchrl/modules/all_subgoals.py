@@ -1,0 +1,239 @@
+"""hDRQNv3's network and policy: one memory of the whole episode, the values of all subgoals on it.
+
+The LSTM reads observation and previous action, not the subgoal, and goes on through the options of an episode. On
+its output stand a dueling head for every subgoal (sub level) and one over the subgoals (meta level). One pass gives
+all of them, in acting and learning alike.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Categorical, Unbounded
+from torchrl.envs.transforms import TensorDictPrimer
+from torchrl.modules import recurrent_mode
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy
+from hdrqn_torchrl.modules.features import Features
+from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
+from hdrqn_torchrl.modules.q_network import State, dueling
+
+
+class AllSubgoalsNetwork(nn.Module):
+    """Q-values of every action for every subgoal, and of every subgoal, from one memory.
+
+    Args:
+        features: maps observations to vectors of ``features.out_features``.
+        num_actions: A.
+        num_subgoals: G.
+        hidden_size: H, size of the LSTM.
+        head_size: units of the hidden layer of each level's heads.
+        joint: whether the meta level, too, trains the memory; ``False``: it only reads it.
+
+    Examples:
+        >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
+        >>> network = AllSubgoalsNetwork(FullyConnectedFeatures(6, (8,)), num_actions=4, num_subgoals=2, hidden_size=16)
+        >>> observation, previous_action = torch.zeros(3, 5, 6), torch.zeros(3, 5, dtype=torch.int64)
+        >>> init, mask = torch.zeros(3, 5, dtype=torch.bool), torch.ones(3, 5, 2, dtype=torch.bool)
+        >>> action_value, subgoal_value = network.unroll(observation, previous_action, init, mask)
+        >>> action_value.shape, subgoal_value.shape
+        (torch.Size([3, 5, 2, 4]), torch.Size([3, 5, 2]))
+    """
+
+    _one_hot: Tensor
+
+    def __init__(
+        self,
+        features: Features,
+        *,
+        num_actions: int,
+        num_subgoals: int,
+        hidden_size: int = 128,
+        head_size: int = 128,
+        joint: bool = True,
+    ) -> None:
+        super().__init__()
+        for name, value in (("hidden_size", hidden_size), ("head_size", head_size)):
+            if value < 1:
+                raise ValueError(f"{name} must be >= 1, got {value}; use 128.")
+        self.features, self.hidden_size, self.joint = features, hidden_size, joint
+        self.num_actions, self.num_subgoals = num_actions, num_subgoals
+        self.register_buffer("_one_hot", torch.eye(num_actions), persistent=False)
+        self.memory = nn.LSTM(features.out_features + num_actions, hidden_size, batch_first=True)
+        self.sub_head = nn.Sequential(
+            nn.Linear(hidden_size, head_size), nn.ReLU(), nn.Linear(head_size, num_subgoals * (1 + num_actions))
+        )
+        # Which subgoals are left decides which one pays; the memory need not count them.
+        self.meta_head = nn.Sequential(
+            nn.Linear(hidden_size + num_subgoals, head_size), nn.ReLU(), nn.Linear(head_size, 1 + num_subgoals)
+        )
+
+    def initial_state(self, *batch: int) -> State:
+        """Zero LSTM state, two tensors ``[*batch, H]``."""
+        zeros = self._one_hot.new_zeros((*batch, self.hidden_size))
+        return zeros, zeros.clone()
+
+    def _inputs(self, observation: Tensor, previous_action: Tensor, init: Tensor) -> Tensor:
+        action = self._one_hot[previous_action] * ~init.unsqueeze(-1)  # none at the first step of an episode
+        return torch.cat([self.features(observation), action], -1)
+
+    def _values(self, hidden: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        action_value = dueling(self.sub_head(hidden).unflatten(-1, (self.num_subgoals, -1)))
+        remembered = hidden if self.joint else hidden.detach()
+        return action_value, dueling(self.meta_head(torch.cat([remembered, mask.to(hidden.dtype)], -1)))
+
+    def step(
+        self, observation: Tensor, previous_action: Tensor, init: Tensor, mask: Tensor, state: State
+    ) -> tuple[Tensor, Tensor, State]:
+        """One decision.
+
+        Args:
+            observation: ``[*, ...]``.
+            previous_action: ``[*]`` int64; not read where ``init``.
+            init: ``[*]`` bool; where set, the state restarts from zero.
+            mask: subgoals that can be chosen ``[*, G]`` bool.
+            state: LSTM state, two tensors ``[*, H]``.
+
+        Returns:
+            Q-values ``[*, G, A]`` and ``[*, G]``, and the state after ``observation``.
+        """
+        inputs = self._inputs(observation, previous_action, init)
+        state = tuple(part.masked_fill(init.unsqueeze(-1), 0.0) for part in state)  # type: ignore[assignment]
+        if inputs.ndim == 1:
+            advanced = torch.lstm_cell(inputs[None], [part[None] for part in state], *lstm_weights(self.memory))
+            hidden, cell = (part[0] for part in advanced)
+        else:
+            hidden, cell = torch.lstm_cell(inputs, state, *lstm_weights(self.memory))
+        return *self._values(hidden, mask), (hidden, cell)
+
+    def unroll(
+        self,
+        observation: Tensor,
+        previous_action: Tensor,
+        init: Tensor,
+        mask: Tensor,
+        state: State | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Q-values along sequences.
+
+        Args:
+            observation, previous_action, init, mask: as in :meth:`step`, ``[B, T, ...]``.
+            state: LSTM state before the first step, two tensors ``[B, H]``; zero if not given.
+
+        Returns:
+            Q-values ``[B, T, G, A]`` and ``[B, T, G]``.
+        """
+        inputs = self._inputs(observation, previous_action, init)
+        state = self.initial_state(len(inputs)) if state is None else state
+        return self._values(restarting_lstm(self.memory, inputs, init, state), mask)
+
+
+class AllSubgoalsPolicy(TensorDictModuleBase):
+    """Both levels of hDRQNv3 as one TensorDict module.
+
+    Acting takes one step: where an option starts the meta level chooses the subgoal, elsewhere it is kept; the action
+    is chosen by the values of that subgoal. Learning (inside ``set_recurrent_mode(True)``) writes the values of all
+    steps, subgoals and actions.
+
+    Args:
+        network: the network.
+        sub_exploration: choice of the action; ``None`` is always greedy.
+        meta_exploration: choice of the subgoal; ``None`` is always greedy.
+        observation_key, previous_action_key, init_key, option_init_key, active_subgoal_key, mask_key: read.
+        action_key, subgoal_key, action_value_key, subgoal_value_key: written.
+        hidden_key, cell_key: LSTM state ``[H]``.
+        repeated_action_key: random stretch in progress ``[2]``, for a :class:`RepeatingEpsilonGreedy`.
+
+    Examples:
+        >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import CellFeatures
+        >>> from hdrqn_torchrl.transforms import SubgoalTransform
+        >>> network = AllSubgoalsNetwork(CellFeatures(5, num_codes=5), num_actions=4, num_subgoals=2, hidden_size=8)
+        >>> policy = AllSubgoalsPolicy(network)
+        >>> transforms = Compose(InitTracker(), SubgoalTransform(num_subgoals=2), policy.make_tensordict_primer())
+        >>> TransformedEnv(MultiGoalGridEnv(num_envs=3), transforms).rollout(4, policy)["action"].shape
+        torch.Size([3, 4])
+    """
+
+    def __init__(
+        self,
+        network: AllSubgoalsNetwork,
+        sub_exploration: EpsilonGreedy | None = None,
+        meta_exploration: EpsilonGreedy | None = None,
+        *,
+        observation_key: NestedKey = keys.OBSERVATION,
+        previous_action_key: NestedKey = keys.PREVIOUS_ACTION,
+        init_key: NestedKey = keys.IS_INIT,
+        option_init_key: NestedKey = keys.OPTION_INIT,
+        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
+        mask_key: NestedKey = keys.SUBGOAL_MASK,
+        action_key: NestedKey = keys.ACTION,
+        subgoal_key: NestedKey = keys.SUBGOAL,
+        action_value_key: NestedKey = keys.ACTION_VALUE,
+        subgoal_value_key: NestedKey = keys.SUBGOAL_VALUE,
+        hidden_key: NestedKey = keys.MEMORY_HIDDEN,
+        cell_key: NestedKey = keys.MEMORY_CELL,
+        repeated_action_key: NestedKey = keys.REPEATED_ACTION,
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.sub_exploration = sub_exploration or EpsilonGreedy(0.0, 0.0)
+        self.meta_exploration = meta_exploration or EpsilonGreedy(0.0, 0.0)
+        self.observation_key, self.previous_action_key, self.init_key = observation_key, previous_action_key, init_key
+        self.option_init_key, self.active_subgoal_key, self.mask_key = option_init_key, active_subgoal_key, mask_key
+        self.action_key, self.subgoal_key = action_key, subgoal_key
+        self.action_value_key, self.subgoal_value_key = action_value_key, subgoal_value_key
+        self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
+        carried = [hidden_key, cell_key, previous_action_key]
+        if isinstance(self.sub_exploration, RepeatingEpsilonGreedy):
+            carried.append(repeated_action_key)
+        self.in_keys = [observation_key, init_key, option_init_key, active_subgoal_key, mask_key, *carried]
+        self.out_keys = [subgoal_key, action_key, *(_next(key) for key in carried)]
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Puts an empty memory into every reset."""
+        state = Unbounded(shape=(self.network.hidden_size,))
+        carried = {self.hidden_key: state, self.cell_key: state.clone()}
+        carried[self.previous_action_key] = Categorical(self.network.num_actions, shape=(), dtype=torch.int64)
+        if self.repeated_action_key in self.in_keys:
+            carried[self.repeated_action_key] = Unbounded(shape=(2,), dtype=torch.int64)
+        return TensorDictPrimer(carried, expand_specs=True)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        read = (self.observation_key, self.previous_action_key, self.init_key, self.mask_key)
+        observation, previous_action, init, mask = (tensordict.get(key) for key in read)
+        init = init.squeeze(-1)
+        if recurrent_mode():
+            values = self.network.unroll(observation, previous_action, init, mask)
+            return tensordict.set(self.action_value_key, values[0]).set(self.subgoal_value_key, values[1])
+        state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
+        action_value, subgoal_value, (hidden, cell) = self.network.step(observation, previous_action, init, mask, state)
+        starts = tensordict.get(self.option_init_key).squeeze(-1)
+        chosen = self.meta_exploration(subgoal_value, mask)
+        subgoal = torch.where(starts, chosen, tensordict.get(self.active_subgoal_key))
+        action = self._choose_action(tensordict, values_of(action_value, subgoal))
+        tensordict.set(self.subgoal_key, subgoal).set(self.action_key, action)
+        for key, value in ((self.hidden_key, hidden), (self.cell_key, cell), (self.previous_action_key, action)):
+            tensordict.set(_next(key), value)
+        return tensordict
+
+    def _choose_action(self, tensordict: TensorDictBase, action_value: Tensor) -> Tensor:
+        if not isinstance(self.sub_exploration, RepeatingEpsilonGreedy):
+            return self.sub_exploration(action_value)
+        action, carried = self.sub_exploration.extend(action_value, tensordict.get(self.repeated_action_key))
+        tensordict.set(_next(self.repeated_action_key), carried)
+        return action
+
+
+def values_of(action_value: Tensor, subgoal: Tensor) -> Tensor:
+    """The values ``[*, A]`` of one subgoal ``[*]`` out of all ``[*, G, A]``."""
+    index = subgoal[..., None, None].expand(*subgoal.shape, 1, action_value.shape[-1])
+    return action_value.gather(-2, index).squeeze(-2)
+
+
+def _next(key: NestedKey) -> tuple[str, ...]:
+    return ("next", *((key,) if isinstance(key, str) else key))

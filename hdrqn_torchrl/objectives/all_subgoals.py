@@ -1,0 +1,227 @@
+r"""hDRQNv3's loss: every subgoal and both levels learn from every step.
+
+Sub level, for each subgoal g, whichever was pursued:
+
+.. math:: r^g_t = 1[g\ attained] + r_{wrong} 1[another\ attained] + r_{hazard} 1[hazard],
+          \quad y^g_t = r^g_t + \gamma_S (1 - e^g_t) ((1 - \lambda_t) V^g(s_{t+1}) + \lambda_t y^g_{t+1})
+
+where :math:`e^g_t` is the end of the episode or of the subgoal, and :math:`\lambda_t` is lambda where the next action
+is greedy for g, else 0 (Watkins' cut). Meta level, by intra-option learning (Sutton, Precup and Singh, 1998): a step
+belongs to every option that would have taken its action,
+
+.. math:: y_t(g) = r^{ex}_t + \gamma_M U_{t+1}(g)
+
+with :math:`U(g) = \max_{g'} Q^M(s', g')` where g was attained, else :math:`Q^M(s', g)`. So the meta level, too, learns
+from every step and not only from those at which options begin.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.utils import unravel_key
+from torch import Tensor
+from torchrl.modules import set_recurrent_mode
+from torchrl.objectives import LossModule
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules import AllSubgoalsPolicy
+from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, watkins_trace
+
+
+class AllSubgoalsLoss(LossModule):
+    """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + 1]`` of consecutive steps.
+
+    The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
+    on through ends of episodes; each should begin where an episode does, because the memory starts empty.
+
+    Args:
+        policy: network and keys.
+        sub_gamma: discount of the sub level. A low one makes haste pay: of two ways, the shorter stands out.
+        meta_gamma: discount of the meta level, per environment step.
+        trace_decay: lambda.
+        reached_reward, wrong_subgoal_reward, hazard_reward: of the sub level, for attaining the subgoal, attaining
+            another one, meeting the hazard.
+        double: Double Q-learning.
+        all_subgoals: ``False``: only the subgoal that was pursued learns, at both levels.
+        intra_option: ``False``: the meta level learns from the steps at which options begin only.
+        max_meta_target: largest return of the task there can be, if known.
+
+    Raises:
+        ValueError: if an argument breaks its rule.
+
+    Examples:
+        See :func:`hdrqn_torchrl.algorithms.make_v3`, which builds one.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        action: NestedKey = keys.ACTION
+        attained: NestedKey = keys.ATTAINED
+        hazard: NestedKey | None = keys.HAZARD
+        extrinsic_reward: NestedKey = keys.EXTRINSIC_REWARD
+        done: NestedKey = keys.DONE
+        terminated: NestedKey = keys.TERMINATED
+        active_subgoal: NestedKey = keys.ACTIVE_SUBGOAL
+        option_init: NestedKey = keys.OPTION_INIT
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    policy: AllSubgoalsPolicy
+    policy_params: TensorDictParams
+    target_policy_params: TensorDictParams
+    out_keys = ["loss", "sub_loss", "meta_loss", "td_error", "q_value", "target", "meta_q_value", "trained_steps"]
+
+    def __init__(
+        self,
+        policy: AllSubgoalsPolicy,
+        *,
+        sub_gamma: float = 0.95,
+        meta_gamma: float = 0.97,
+        trace_decay: float = 0.8,
+        reached_reward: float = 1.0,
+        wrong_subgoal_reward: float = -0.5,
+        hazard_reward: float = -1.0,
+        double: bool = True,
+        all_subgoals: bool = True,
+        intra_option: bool = True,
+        max_meta_target: float | None = None,
+    ) -> None:
+        for name, value in (("sub_gamma", sub_gamma), ("meta_gamma", meta_gamma), ("trace_decay", trace_decay)):
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
+        super().__init__()
+        self.convert_to_functional(policy, "policy", create_target_params=True)
+        # As in RecurrentDQNLoss: the modules as they are called, outside the module tree.
+        target = deepcopy(policy)
+        self._modules["target_policy_params"].to_module(target, preserve_module_state=False)
+        self.__dict__["_policies"] = (policy, target)
+        self.sub_gamma, self.meta_gamma, self.trace_decay = sub_gamma, meta_gamma, trace_decay
+        self.reached_reward, self.wrong_subgoal_reward = reached_reward, wrong_subgoal_reward
+        self.hazard_reward, self.double = hazard_reward, double
+        self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
+
+    def _forward_value_estimator_keys(self, **kwargs) -> None:
+        """The keys are read at every call; nothing to pass on."""
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        policy, k = self._policies[0], self.tensor_keys
+        read = [policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key, k.action]
+        nexts = [k.attained, k.extrinsic_reward, k.done, k.terminated, k.active_subgoal]
+        nexts += [] if k.hazard is None else [k.hazard]
+        return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        online, target = self._values(tensordict)
+        steps = tensordict[:, :-1]
+        events = self._events(steps)
+        with torch.no_grad():
+            sub_target, meta_target, agrees = self._targets(online, target, tensordict, events)
+        action = steps[self.tensor_keys.action][..., None, None].expand(*events["attained"].shape, 1)
+        sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
+        meta_value = online[1][:, :-1]
+        sub_steps, meta_steps = self._trained(steps, events, agrees)
+        sub_loss, sub_error = _masked_square(sub_value, sub_target, sub_steps)
+        meta_loss, meta_error = _masked_square(meta_value, meta_target, meta_steps)
+        with torch.no_grad():
+            report = {
+                "td_error": sub_error,
+                "meta_td_error": meta_error,
+                "q_value": _masked_mean(sub_value, sub_steps),
+                "target": _masked_mean(sub_target, sub_steps),
+                "meta_q_value": _masked_mean(meta_value, meta_steps),
+                "trained_steps": sub_steps.sum(),
+            }
+        losses = {"loss": sub_loss + meta_loss, "sub_loss": sub_loss.detach(), "meta_loss": meta_loss.detach()}
+        return TensorDict({**losses, **report}, [])
+
+    def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network."""
+        policy, target_policy = self._policies
+        inputs = tensordict.select(*policy.in_keys, strict=False)
+
+        def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor]:
+            values = which(inputs.copy())
+            return values.get(which.action_value_key), values.get(which.subgoal_value_key)
+
+        with set_recurrent_mode(True):
+            with torch.no_grad():
+                target = run(target_policy)
+            return run(policy), target
+
+    def _events(self, steps: TensorDictBase) -> dict[str, Tensor]:
+        """What each step ``[B, T]`` led to, as far as it does not depend on values."""
+        k, after = self.tensor_keys, steps["next"]
+        attained = after[k.attained]
+        done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
+        other = attained.sum(-1, keepdim=True) > attained.long()  # [B, T, G]
+        reward = self.reached_reward * attained + self.wrong_subgoal_reward * other
+        if k.hazard is not None:
+            reward = reward + self.hazard_reward * after[k.hazard]
+        return {
+            "attained": attained,
+            "sub_reward": reward,
+            "extrinsic_reward": after[k.extrinsic_reward].expand_as(reward),
+            "sub_end": attained | terminated.unsqueeze(-1),
+            "meta_end": terminated.unsqueeze(-1).expand_as(attained),
+            # Cut off by a time limit: what follows is not in the sequence.
+            "unseen": (done & ~terminated).unsqueeze(-1).expand_as(attained),
+        }
+
+    def _targets(
+        self,
+        online: tuple[Tensor, Tensor],
+        target: tuple[Tensor, Tensor],
+        tensordict: TensorDictBase,
+        events: dict[str, Tensor],
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Targets of both levels ``[B, T, G]``, and whether each option agrees with the action, ``[B, T, G]`` bool."""
+        mask = tensordict[self._policies[0].mask_key]
+        chooser = online if self.double else target
+        sub_next = double_q_value(chooser[0], target[0])[:, 1:]
+        best_next = double_q_value(chooser[1], target[1], mask)[:, 1:].unsqueeze(-1).expand_as(sub_next)
+        meta_next = torch.where(events["attained"], best_next, target[1][:, 1:])
+        agrees = online[0].argmax(-1) == tensordict[self.tensor_keys.action].unsqueeze(-1)  # [B, T + 1, G]
+        trace = watkins_trace(agrees, self.trace_decay)[:, :-1].masked_fill(events["unseen"], 0.0)
+        # One recursion serves both levels, as columns beside each other.
+        unseen = torch.cat([events["unseen"] & ~events["attained"], events["unseen"]], -1)
+        trace = torch.cat([trace, trace.masked_fill(events["attained"], 0.0)], -1)
+        trace[:, :-1].masked_fill_(unseen[:, 1:], 0.0)  # there is no target to take over
+        reward = torch.cat([events["sub_reward"], events["extrinsic_reward"]], -1)
+        ended = torch.cat([events["sub_end"], events["meta_end"]], -1) | unseen
+        discount = torch.ones_like(sub_next)
+        discount = torch.cat([self.sub_gamma * discount, self.meta_gamma * discount], -1)
+        following = torch.cat([sub_next, meta_next], -1)
+        returns = lambda_returns(reward, ended, following, trace, discount)
+        sub_target, meta_target = returns.chunk(2, -1)
+        if self.max_meta_target is not None:
+            meta_target = meta_target.clamp(min=0.0, max=self.max_meta_target)
+        return sub_target.clamp(max=self.reached_reward), meta_target, agrees[:, :-1]
+
+    def _trained(self, steps: TensorDictBase, events: dict[str, Tensor], agrees: Tensor) -> tuple[Tensor, Tensor]:
+        """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
+        k = self.tensor_keys
+        left = steps[self._policies[0].mask_key]
+        pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
+        sub_steps = left & (~events["unseen"] | events["attained"])
+        meta_steps = left & ~events["unseen"] & (agrees | pursued)
+        if not self.all_subgoals:
+            sub_steps, meta_steps = sub_steps & pursued, meta_steps & pursued
+        if not self.intra_option:
+            meta_steps = meta_steps & pursued & steps[k.option_init]
+        return sub_steps, meta_steps
+
+
+def _masked_mean(value: Tensor, mask: Tensor) -> Tensor:
+    return value.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
+
+
+def _masked_square(value: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean squared and mean absolute error over ``mask``."""
+    error = (value - target).masked_fill(~mask, 0.0)
+    count = mask.sum().clamp(min=1)
+    return error.square().sum() / count, error.detach().abs().sum() / count
