@@ -200,8 +200,8 @@ def read_config(folder: Path) -> DictConfig:
         stored = OmegaConf.load(path)
         config = OmegaConf.merge(OmegaConf.structured(Schema), stored)
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
+    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AssertionError, RecursionError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
         raise SettingsError(f"{path} can't be read as the settings of a run: {reason}") from error
     assert isinstance(config, DictConfig)
     return config
@@ -280,7 +280,7 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
             raise SettingsError(f"an argument must read key=value, got {wrong[0]!r}; --help shows all of them.")
         try:
             settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.from_dotlist(arguments))
-        except OmegaConfBaseException as error:
+        except (OmegaConfBaseException, YAMLError) as error:
             known = ", ".join(each.name for each in fields(schema))
             raise SettingsError(f"{str(error).splitlines()[0]}; the settings are {known}.") from error
         if missing := OmegaConf.missing_keys(settings):

@@ -4,7 +4,7 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.figure import Figure
 
-from hdrqn_torchrl.plotting import plot_comparison, plot_run, read_metrics
+from hdrqn_torchrl.plotting import plot_run
 
 METRICS = {
     "frames": [0.0, 100.0, 200.0],
@@ -29,13 +29,6 @@ def lines(axis):
     return {line.get_label(): line.get_xydata().tolist() for line in axis.get_lines() if line.get_linestyle() == "-"}
 
 
-def test_read_metrics_gives_columns_and_nan_for_empty_cells(tmp_path):
-    (tmp_path / "metrics.csv").write_text("frames,loss\n0,\n10,0.5\n")
-    metrics = read_metrics(tmp_path / "metrics.csv")
-    assert metrics["frames"] == [0.0, 10.0]
-    assert math.isnan(metrics["loss"][0]) and metrics["loss"][1] == 0.5
-
-
 def test_curves_skip_the_gaps_and_references_are_dashed(tmp_path, figures):
     plot_run(METRICS, tmp_path / "curves.png", title="a run", references=REFERENCES)
     returns, _, _, steps = figures[0].axes
@@ -58,13 +51,3 @@ def test_the_picture_is_written_without_pyplots_global_state(tmp_path):
 def test_a_run_without_results_has_an_empty_picture(tmp_path, metrics):
     plot_run(metrics, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").exists()
-
-
-def test_a_comparison_draws_mean_and_range_where_all_seeds_were_evaluated(tmp_path, figures):
-    first = {"frames": [0.0, 10.0, 20.0], "greedy/return": [0.0, 1.0, math.nan], "greedy/success": [0.0, 0.5, math.nan]}
-    second = {"frames": [0.0, 10.0, 20.0], "greedy/return": [1.0, 2.0, 2.0], "greedy/success": [0.5, 1.0, 1.0]}
-    plot_comparison({"v2": [first, second]}, tmp_path / "comparison.png", references=REFERENCES)
-    returns, success = figures[0].axes
-    assert lines(returns) == {"v2 (2 seeds)": [[0.0, 0.5], [10.0, 1.5]]}
-    assert lines(success) == {"v2 (2 seeds)": [[0.0, 0.25], [10.0, 0.75]]}
-    assert returns.collections[0].get_datalim(returns.transData).ymax == 2.0
