@@ -1,0 +1,26 @@
+"""Recorded episodes: what the agent sees, wants and does, as pictures, videos and terminal text."""
+
+from hdrqn_torchrl.rendering.episodes import Decision, Frame, Score, record_episodes
+from hdrqn_torchrl.rendering.levels import BarSpans, bar_spans
+from hdrqn_torchrl.rendering.picture import draw_frame
+from hdrqn_torchrl.rendering.scenes import GridScene, Scene, scene_of
+from hdrqn_torchrl.rendering.terminal import draw_text, play_in_terminal
+from hdrqn_torchrl.rendering.video import check_video, hold, write_video
+
+__all__ = [
+    "BarSpans",
+    "Decision",
+    "Frame",
+    "GridScene",
+    "Scene",
+    "Score",
+    "bar_spans",
+    "check_video",
+    "draw_frame",
+    "draw_text",
+    "hold",
+    "play_in_terminal",
+    "record_episodes",
+    "scene_of",
+    "write_video",
+]

@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+import torch
+from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT, small_env
+from torchrl.envs import GymEnv
+
+from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.envs.cells import palette
+from hdrqn_torchrl.rendering import scene_of
+
+CELL = 20  # pixels
+FLOOR, WALL, OBSTACLE, GOAL_1, GOAL_2 = palette(5).tolist()
+
+
+def corridor(**changes):
+    """Agent, obstacle, goal 1, goal 2 from left to right; the agent sees one cell around it."""
+    settings = {"layout": CORRIDOR, "num_obstacles": 1, "view": 3} | changes
+    env = MultiGoalGridEnv(1, **settings)
+    env.set_world(AGENT, OBJECTS)
+    return env
+
+
+def pixels(image):
+    return np.asarray(image).astype(int)
+
+
+def cell(picture, row, column, *, size=CELL):
+    return picture[row * size : (row + 1) * size, column * size : (column + 1) * size]
+
+
+def commonest(part):
+    colours, counts = np.unique(part.reshape(-1, 3), axis=0, return_counts=True)
+    return colours[counts.argmax()].tolist()
+
+
+def has(part, colour):
+    return bool((part == colour).all(-1).any())
+
+
+class TestWorldPicture:
+    def test_every_cell_has_its_colour_and_what_is_not_seen_is_faded(self):
+        picture = pixels(scene_of(corridor()).draw_world(6 * CELL))
+        assert picture.shape == (3 * CELL, 6 * CELL, 3)
+        assert commonest(cell(picture, 0, 1)) == WALL
+        assert commonest(cell(picture, 1, 2)) == OBSTACLE
+        for column, colour in ((3, GOAL_1), (4, GOAL_2)):
+            assert commonest(cell(picture, 1, column)) == [(part + 150) // 2 for part in colour]
+        assert commonest(cell(picture, 0, 5)) == [(part + 150) // 2 for part in WALL]
+
+    def test_the_view_is_outlined(self):
+        picture = pixels(scene_of(corridor()).draw_world(6 * CELL))
+        black = (picture == 0).all(-1)
+        assert black[:, 0].all() and black[0, : 3 * CELL].all() and black[:, 3 * CELL - 1].all()
+        assert not black[:, 3 * CELL :].any()
+
+    def test_a_goal_carries_its_number(self):
+        world = scene_of(corridor(view=None)).draw_world(6 * CELL)
+        one, two = (cell(pixels(world), 1, column) for column in (3, 4))
+        assert has(one, [255] * 3) and has(two, [255] * 3)
+        assert ((one == 255).all(-1) != (two == 255).all(-1)).any()
+
+    def test_only_the_subgoal_in_force_has_a_ring(self):
+        plain, first, second = (
+            pixels(scene_of(corridor(), subgoal=each).draw_world(6 * CELL)) for each in (None, 0, 1)
+        )
+        below_first, below_second = (
+            (slice(2 * CELL, 2 * CELL + 4), slice(at, at + CELL)) for at in (3 * CELL, 4 * CELL)
+        )
+        assert has(first[below_first], GOAL_1) and not has(plain[below_first], GOAL_1)
+        assert has(second[below_second], GOAL_2) and not has(first[below_second], GOAL_2)
+
+    def test_the_ring_vanishes_with_its_goal(self):
+        env = corridor()
+        env.state = env.rules.place(AGENT, torch.tensor([[8, env.rules.nowhere, 10]]))
+        with_subgoal, without = (pixels(scene_of(env, subgoal=each).draw_world(6 * CELL)) for each in (0, None))
+        assert (with_subgoal == without).all()
+
+    @pytest.mark.parametrize(("action", "axis", "side"), [(0, 0, -1), (1, 0, 1), (2, 1, -1), (3, 1, 1)])
+    def test_the_agent_points_where_it_goes(self, action, axis, side):
+        agent = cell(pixels(scene_of(corridor(), action=action).draw_world(6 * 40)), 1, 1, size=40)
+        arrow = np.argwhere((agent[10:30, 10:30] == 255).all(-1))
+        widths = [np.ptp(arrow[arrow[:, axis] == at][:, 1 - axis]) for at in np.unique(arrow[:, axis])]
+        assert np.sign(widths[0] - widths[-1]) == side  # the thin end is ahead
+        at_rest = cell(pixels(scene_of(corridor()).draw_world(6 * 40)), 1, 1, size=40)
+        assert not has(at_rest[10:30, 10:30], [255] * 3)
+
+
+def test_the_view_is_the_observation_with_the_agent_in_its_centre():
+    env = corridor()
+    picture = pixels(scene_of(env).draw_view(60))
+    assert picture.shape == (60, 60, 3)
+    assert commonest(cell(picture, 1, 2)) == OBSTACLE and commonest(cell(picture, 1, 0)) == WALL
+    assert has(cell(picture, 1, 1), [0, 0, 0])
+
+
+def test_the_subgoal_is_marked_in_the_view_where_it_is_seen():
+    env = corridor(view=5)
+    seen, unseen, plain = (pixels(scene_of(env, subgoal=each).draw_view(100)) for each in (0, 1, None))
+    assert (seen != plain).any() and (unseen == plain).all()
+
+
+def test_text_shows_the_same():
+    scene = scene_of(corridor(), subgoal=1)
+    assert scene.write_world().plain == "████████████\n██ @ x 1>2██\n████████████"
+    assert scene.write_view().plain == "██████\n██ @ x\n██████"
+    room = small_env(1, num_obstacles=0, num_goals=1, view=3)
+    room.set_world(torch.tensor([6]), torch.tensor([[18]]))
+    assert scene_of(room).write_world().plain.splitlines()[1:4] == ["██ @ ·  ██", "██ · ·  ██", "██     1██"]
+
+
+def test_names_and_ends():
+    scene = scene_of(corridor())
+    assert scene.subgoal_names == ("goal 1", "goal 2")
+    assert [list(colour) for colour in scene.subgoal_colours] == [GOAL_1, GOAL_2]
+    assert scene.action_names[RIGHT] == "→ right" and len(scene.action_names) == 4
+    ends = [scene.outcome(*each) for each in ((True, True), (False, True), (False, False))]
+    assert ends == ["both goals in order", "all goals, but not in order", "time is up"]
+    others = [scene_of(small_env(1, num_goals=goals)).outcome(True, True) for goals in (1, 3)]
+    assert others == ["goal reached", "all 3 goals in order"]
+
+
+def test_other_environments_have_no_picture():
+    with pytest.raises(ValueError, match="env must be a MultiGoalGridEnv to be drawn, got GymEnv"):
+        scene_of(GymEnv("CartPole-v1"))
