@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -29,7 +30,8 @@ class Interrupted(KeyboardInterrupt):
 
 
 class StopRequest:
-    """Remembers a SIGINT or SIGTERM until :meth:`check` is called; a second one is a KeyboardInterrupt at once.
+    """Remembers a SIGINT or SIGTERM until :meth:`check` is called; a second one, later than a second
+    after the first, is a KeyboardInterrupt at once.
 
     Examples:
         >>> with StopRequest() as stop:
@@ -44,6 +46,7 @@ class StopRequest:
 
     def __init__(self) -> None:
         self._requested: int | None = None
+        self._requested_at = 0.0
         self._at_once = False
         self._former: dict[int, object] = {}
 
@@ -59,9 +62,12 @@ class StopRequest:
         self._former = {}
 
     def _handle(self, number: int, _: FrameType | None) -> None:
+        now = time.monotonic()
         if self._requested is not None:
+            if now - self._requested_at < 1.0:
+                return  # the same request: a terminal and a parent process both pass it on
             raise KeyboardInterrupt
-        self._requested = number
+        self._requested, self._requested_at = number, now
         if self._at_once:
             raise Interrupted(number)
 

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import csv
+import fcntl
+import importlib
+import json
 import os
+import secrets
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from rich.console import Console
@@ -36,6 +43,8 @@ class CSVLog:
         if path.exists():
             rows = self._read()
             self.columns, self.rows = list(rows[0]) if rows else [], len(rows)
+            if not path.read_bytes().endswith(b"\n"):
+                self._rewrite(self.columns, rows)  # the next row would be appended to half of one
 
     def write(self, row: Row) -> None:
         """Appends one row; it is on the disk when this returns."""
@@ -84,11 +93,19 @@ class RunLogger:
         total_frames: end of the progress bar.
         loggers: any TorchRL loggers (TensorBoard, W&B, ...); scalars are logged under their column's name.
         console: where progress goes; a terminal shows a bar, anything else a line per greedy evaluation.
+        label: put before those lines, to tell the runs of a sweep apart.
     """
 
     def __init__(
-        self, folder: Path, *, total_frames: int, loggers: list[Logger] | None = None, console: Console | None = None
+        self,
+        folder: Path,
+        *,
+        total_frames: int,
+        loggers: list[Logger] | None = None,
+        console: Console | None = None,
+        label: str = "",
     ) -> None:
+        self.label = f"{label}  " if label else ""
         self.csv, self.loggers = CSVLog(folder / "metrics.csv"), loggers or []
         self.console = console or Console(file=sys.stderr)
         self._progress = Progress(
@@ -109,8 +126,7 @@ class RunLogger:
         self.csv.write(row)
         frames = int(row["frames"])
         for logger in self.loggers:
-            for name, value in row.items():
-                logger.log_scalar(name, value, step=frames)
+            logger.log_metrics(row, step=frames)
         evaluated = "greedy/return" in row
         if evaluated:
             ceiling = f" of {row['greedy/ceiling']:.2f}" if "greedy/ceiling" in row else ""
@@ -119,7 +135,7 @@ class RunLogger:
         numbers = progress_line(row, self._last_greedy)
         self._progress.update(self._task, completed=frames, numbers=numbers)
         if evaluated and not self.console.is_terminal:
-            self.console.print(f"{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
+            self.console.print(f"{self.label}{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
 
     def state_dict(self) -> dict[str, Any]:
         """Its position in the files."""
@@ -131,8 +147,10 @@ class RunLogger:
         self._last_greedy = state["last_greedy"]
 
     def close(self) -> None:
-        """Stops the progress bar."""
+        """Stops the progress bar and ends the loggers: what they hold back is written."""
         self._progress.stop()
+        for logger in self.loggers:
+            logger.close()
 
 
 def progress_line(row: Row, greedy: str) -> str:
@@ -152,3 +170,128 @@ def make_tensorboard_logger(folder: Path) -> Logger:
     from torchrl.record.loggers.tensorboard import TensorboardLogger
 
     return TensorboardLogger("tensorboard", log_dir=str(folder))
+
+
+def make_wandb_logger(
+    folder: Path, *, project: str = "hdrqn_torchrl", offline: bool = False, settings: dict[str, Any] | None = None
+) -> Logger:
+    """TorchRL's Weights & Biases logger, writing to ``folder/wandb``.
+
+    ``folder/wandb.json`` keeps the id of the W&B run: a resumed run goes on with it.
+
+    Args:
+        folder: run folder; its last two parts are the name of the W&B run.
+        project: W&B project.
+        offline: keeps everything in ``folder/wandb``; ``wandb sync`` uploads it later.
+        settings: shown beside the curves.
+
+    Raises:
+        ImportError: if wandb is not installed.
+    """
+    _require("wandb")
+    from torchrl.record.loggers.wandb import WandbLogger
+
+    run_id = _recorded(folder / "wandb.json") or secrets.token_hex(4)
+    _record(folder / "wandb.json", run_id)
+    logger = WandbLogger(
+        _name(folder),
+        save_dir=str(folder),
+        id=run_id,
+        project=project,
+        mode="offline" if offline else None,  # the logger's own offline= would stay set for later runs in this process
+        reinit="finish_previous",  # of a sweep
+        log_env_packages=False,  # paths of this machine
+    )
+    logger.log_hparams(settings or {})
+    return logger
+
+
+def make_mlflow_logger(
+    folder: Path,
+    *,
+    tracking_uri: str,
+    experiment: str = "hdrqn_torchrl",
+    settings: dict[str, Any] | None = None,
+) -> Logger:
+    """TorchRL's MLflow logger.
+
+    ``folder/mlflow.json`` keeps the id of the MLflow run: a resumed run goes on with it.
+
+    Args:
+        folder: run folder; its last two parts are the name of the MLflow run.
+        tracking_uri: address of a server, or ``sqlite:///`` and the path of a file, which is created.
+        experiment: MLflow experiment; created if it does not exist.
+        settings: logged as parameters when the run begins.
+
+    Raises:
+        ImportError: if mlflow is not installed.
+        ValueError: if the recorded run is not in that database.
+    """
+    mlflow = _require("mlflow")
+    from torchrl.record.loggers.mlflow import MLFlowLogger
+
+    mlflow.end_run()  # of an earlier job of a sweep in this process
+    mlflow.set_tracking_uri(tracking_uri)
+    with _one_at_a_time(tracking_uri):
+        mlflow.set_experiment(experiment)
+    record = folder / "mlflow.json"
+    if run_id := _recorded(record):
+        os.environ["MLFLOW_RUN_ID"] = run_id  # read once, when the logger starts its run
+    try:
+        logger = MLFlowLogger(experiment, tracking_uri)
+    except mlflow.exceptions.MlflowException as error:
+        raise ValueError(
+            f"tracking_uri must be where the run was logged before, and {tracking_uri} does not know it ({error}); "
+            f"remove {record} to log the rest as a new run."
+        ) from error
+    finally:
+        os.environ.pop("MLFLOW_RUN_ID", None)
+    if run_id is None:
+        _record(record, logger.experiment.info.run_id)
+        mlflow.set_tag("mlflow.runName", _name(folder))
+        logger.log_hparams(_flat(settings or {}))
+    return logger
+
+
+@contextmanager
+def _one_at_a_time(tracking_uri: str) -> Iterator[None]:
+    """MLflow fails if two processes create the same SQLite file at once, as the first jobs of a parallel sweep do."""
+    if not tracking_uri.startswith("sqlite:///"):
+        yield
+        return
+    path = Path(tracking_uri.removeprefix("sqlite:///"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.with_name(f"{path.name}.lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _require(package: str) -> ModuleType:
+    """Imports an optional package."""
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        raise ImportError(
+            f"logger={package} needs the package {package} ({error}): pip install 'hdrqn_torchrl[{package}]'"
+        ) from error
+
+
+def _name(folder: Path) -> str:
+    return "/".join(folder.absolute().parts[-2:])
+
+
+def _recorded(path: Path) -> str | None:
+    """Id of the run at the service, if this is a resumed run."""
+    return json.loads(path.read_text())["id"] if path.exists() else None
+
+
+def _record(path: Path, run_id: str) -> None:
+    path.write_text(json.dumps({"id": run_id}) + "\n")
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings under their full names, as MLflow wants its parameters."""
+    flat: dict[str, Any] = {}
+    for name, value in settings.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat
