@@ -152,7 +152,7 @@ def _targets(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Every ``_target_`` in a configuration, with its full name."""
     if isinstance(node, DictConfig):
         for key in node:
-            name = f"{path}.{key}" if path else str(key)
+            name = f"{path}.{key!s}" if path else str(key)
             if key == "_target_":
                 yield name, node[key]
             else:
@@ -183,6 +183,8 @@ def explain(error: Exception) -> str:
         return str(error)
     path = str(error).rpartition("full_key: ")[2].strip() if "full_key: " in str(error) else ""
     cause = error.__cause__
+    if isinstance(cause, (ImportError, OSError)):
+        return str(cause)
     if isinstance(cause, ValueError):
         return f"{path}.{cause}" if path else str(cause)
     return f"{path}: {cause or error}; `python train.py --cfg job` shows every setting and its default."
@@ -200,6 +202,8 @@ def read_config(folder: Path) -> DictConfig:
         stored = OmegaConf.load(path)
         config = OmegaConf.merge(OmegaConf.structured(Schema), stored)
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        if not all(isinstance(config[part], DictConfig) for part in ("env", "algo", "network", "logger")):
+            raise TypeError("env, algo, network and logger must have settings below them")
     except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AssertionError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise SettingsError(f"{path} can't be read as the settings of a run: {reason}") from error
@@ -279,7 +283,9 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
         if wrong := [argument for argument in arguments if "=" not in argument]:
             raise SettingsError(f"an argument must read key=value, got {wrong[0]!r}; --help shows all of them.")
         try:
-            settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.from_dotlist(arguments))
+            settings = OmegaConf.merge(
+                OmegaConf.structured(schema), OmegaConf.from_dotlist(list(map(_quoted, arguments)))
+            )
         except (OmegaConfBaseException, YAMLError) as error:
             known = ", ".join(each.name for each in fields(schema))
             raise SettingsError(f"{str(error).splitlines()[0]}; the settings are {known}.") from error
@@ -288,3 +294,9 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
         run(OmegaConf.to_object(settings))
     except SettingsError as error:
         sys.exit(f"error: {error}")
+
+
+def _quoted(argument: str) -> str:
+    """Lets a value begin with a glob's star, which YAML takes for an alias."""
+    key, _, value = argument.partition("=")
+    return f"{key}='{value}'" if value.startswith("*") else argument

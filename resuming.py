@@ -27,8 +27,10 @@ class Plan:
     folder: Path
     config: DictConfig
     choices: dict[str, str]
-    checkpoint: Path | None
-    """Where to start from; ``None``: from frame 0."""
+    resumed: bool
+    """Whether it goes on with a run that was begun before."""
+    checkpoint: Path | None = None
+    """Where it goes on; ``None``: at the run's newest checkpoint."""
 
 
 def plan(config: DictConfig, folder: Path) -> Plan:
@@ -43,30 +45,31 @@ def plan(config: DictConfig, folder: Path) -> Plan:
     """
     choices = dict(HydraConfig.get().runtime.choices)
     if config.resume is None:
-        if (folder / "config.yaml").exists():
+        if holds_run(folder):
             raise SettingsError(
                 f"{folder} already holds a run, which would be overwritten; `python train.py resume={folder}` goes on "
                 "with it, any other hydra.run.dir starts a new one."
             )
-        return Plan(folder, config, choices, None)
+        return Plan(folder, config, choices, resumed=False)
     if config.resume == "auto":
         run, checkpoint = find_same(config, folder), None
         if run is None:
-            return Plan(folder, config, choices, None)
+            return Plan(folder, config, choices, resumed=False)
     else:
         run, checkpoint = split(Path(config.resume))
         config = with_overrides(read_config(run), read_choices(run), config, HydraConfig.get().overrides.task)
         check(config)
     refuse_differences(run, config)
-    if checkpoint is None:
-        from hdrqn_torchrl.checkpoint import Checkpoints
-
-        checkpoint = Checkpoints(run / "checkpoints").newest()
     if run.resolve() != folder.resolve():
         with contextlib.suppress(OSError):  # Hydra made it for this process; it is empty
             folder.rmdir()
             folder.parent.rmdir()
-    return Plan(run, config, read_choices(run) or choices, checkpoint)
+    return Plan(run, config, read_choices(run) or choices, resumed=True, checkpoint=checkpoint)
+
+
+def holds_run(folder: Path) -> bool:
+    """Whether a training was begun in a folder."""
+    return (folder / "config.yaml").exists() or (folder / "checkpoints").exists()
 
 
 def split(path: Path) -> tuple[Path, Path | None]:
@@ -144,7 +147,7 @@ def differences(stored: DictConfig, config: DictConfig) -> list[str]:
 def _flat(node: Any, path: str = "") -> dict[str, Any]:
     if not isinstance(node, dict) or not node:
         return {path: node}
-    flat = {}
+    flat: dict[str, Any] = {}
     for key, item in node.items():
         flat |= _flat(item, f"{path}.{key}" if path else str(key))
     return flat

@@ -8,8 +8,9 @@ import os
 import random
 import sys
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -17,8 +18,9 @@ from hydra.errors import InstantiationException
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+import sweeps
 from configuration import RunError, SettingsError, build_algorithm, check, explain, pick_device
-from resuming import Plan, plan, record
+from resuming import Plan, holds_run, plan, record
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -32,20 +34,19 @@ def main(config: DictConfig) -> float:
 
     Exit codes: 0 done; 1 failed, and a message says why; 130 and 143 stopped by SIGINT or SIGTERM: resume me.
     """
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    folder, run = Path(HydraConfig.get().runtime.output_dir), None
+    sweeps.refuse_if_stopped()
     try:
         check(config)
         run = plan(config, folder)
-        folder = run.folder
         return train(run)
     except KeyboardInterrupt as stop:
-        code = getattr(stop, "exit_code", 130)
-        print(f"{stop or 'stopped'}; `python train.py resume={folder}` goes on", file=sys.stderr)
-        sys.exit(code)
+        folder = folder if run is None else run.folder
+        print(f"{str(stop) or 'stopped'}; `python train.py resume={folder}` goes on", file=sys.stderr)
+        sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
     except Exception as error:
-        if not (isinstance(error, SettingsError) and (folder / "config.yaml").exists()):  # then it is another's run
-            with contextlib.suppress(OSError):
-                (folder / "error.txt").write_text(traceback.format_exc())
+        if run is None and not holds_run(folder):
+            note_error(folder)
         if HydraConfig.get().mode == RunMode.MULTIRUN or not isinstance(error, (SettingsError, RunError)):
             raise
         sys.exit(f"error: {error}")
@@ -64,33 +65,56 @@ def train(run: Plan) -> float:
 
     torch.set_num_threads(run.config.threads)
     try:
-        with locked(run.folder):
-            clear_leftovers(run)
-            trainer, evaluation_env, references = build(run)
-            record(run)
-            if run.checkpoint is not None:
-                trainer.resume(run.checkpoint)
+        with locked(run.folder), noting_errors(run):
+            trainer, evaluation_env, references = begin(run)
             trainer.train()
             return write_summary(run, trainer, evaluation_env, references)["return_mean"]
     except (InstantiationException, ValueError) as error:
         raise SettingsError(explain(error)) from error
-    except (CheckpointError, NonFiniteError, OSError) as error:
+    except (CheckpointError, NonFiniteError) as error:
         raise RunError(str(error)) from error
+    except OSError as error:
+        remedy = f"mend that, then `python train.py resume={run.folder}` goes on from the last checkpoint"
+        raise RunError(f"{error}; {remedy}.") from error
 
 
-def clear_leftovers(run: Plan) -> None:
-    """Removes what a killed process left in the run folder and what a run that starts again will write again."""
+@contextlib.contextmanager
+def noting_errors(run: Plan) -> Iterator[None]:
+    """A training that fails leaves a traceback; one that can't be resumed with new settings has not failed."""
+    try:
+        yield
+    except Exception as error:
+        if not (run.resumed and isinstance(error, (InstantiationException, ValueError))):
+            note_error(run.folder)
+        raise
+
+
+def note_error(folder: Path) -> None:
+    """Writes the traceback of the error at hand to ``error.txt``."""
+    with contextlib.suppress(OSError):
+        (folder / "error.txt").write_text(traceback.format_exc())
+
+
+def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
+    """Builds what a run needs (:func:`build`), where it begins or where it goes on; clears what is out of date."""
     from hdrqn_torchrl.checkpoint import Checkpoints
 
-    Checkpoints(run.folder / "checkpoints").clean_up()
-    stale = [*run.folder.glob("*.partial"), run.folder / "error.txt"]
-    if run.checkpoint is None:
-        stale.append(run.folder / "metrics.csv")
+    checkpoints = Checkpoints(run.folder / "checkpoints")
+    checkpoints.clean_up()  # first: it may bring back the newest
+    start = run.checkpoint or (checkpoints.newest() if run.resumed else None)
+    stale = [*run.folder.glob("*.partial"), *([run.folder / "metrics.csv"] if start is None else [])]
     for path in stale:
         path.unlink(missing_ok=True)
+    trainer, evaluation_env, references = build(run)
+    if start is not None:
+        trainer.resume(start)
+    record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
+    for name in ("error.txt", "summary.json", "curves.png"):
+        (run.folder / name).unlink(missing_ok=True)
+    return trainer, evaluation_env, references
 
 
-def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, references: dict) -> dict[str, float]:
+def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, references: dict) -> dict[str, Any]:
     """Final greedy evaluation; writes and prints the run's results."""
     from hdrqn_torchrl.evaluation import evaluate
     from hdrqn_torchrl.run_folder import write_results
@@ -145,6 +169,7 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
             run.folder,
             total_frames=config.total_frames,
             loggers=[instantiate(logger, run.folder) for logger in config.logger.loggers],
+            label=run.folder.name if HydraConfig.get().mode == RunMode.MULTIRUN else "",
         ),
         evaluate=lambda: evaluate(
             evaluation_env, algorithm.policy, episodes=config.evaluation.episodes, seed=config.evaluation.seed

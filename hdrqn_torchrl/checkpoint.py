@@ -14,7 +14,7 @@ import shutil
 import sys
 import warnings
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError, CheckpointRotation
 
 TENSORS, STRUCTURE, CHECKSUMS = "tensors.safetensors", "structure.json", "checksums.json"
-SCORE = "greedy_return"
+PREFIX, SCORE = "checkpoint-", "greedy_return"
 _UNSCORED = -sys.float_info.max  # the rotation wants a finite number; this one is never the best
 
 
@@ -125,12 +125,15 @@ class Checkpoints:
             metadata = {SCORE: _UNSCORED if score is None else score}
             return self._rotation.save(DurableCheckpoint(**components), step=step, metadata=metadata)
         except (OSError, SafetensorError) as error:
-            newest = self.newest()
-            left = f"the last good one is {newest}" if newest else "there is no earlier one"
             raise CheckpointError(
-                f"the checkpoint at step {step} can't be written to {self.directory} ({error}); {left}. "
+                f"the checkpoint at step {step} can't be written to {self.directory} ({error}); {self.last_good()}. "
                 "Make room or make the folder writable, then resume the run."
             ) from error
+
+    def last_good(self) -> str:
+        """Names the newest whole checkpoint, for messages."""
+        whole = next(self._whole(), None)
+        return f"the last good checkpoint is {whole}" if whole else "there is no earlier checkpoint"
 
     def load(self, components: Mapping[str, Any], path: Path, device: torch.device | str = "cpu") -> None:
         """Restores components from the checkpoint ``path`` after checking all of it.
@@ -139,36 +142,81 @@ class Checkpoints:
             CheckpointError: if the checkpoint is not whole, or does not fit the components.
         """
         verify(path)
-        DurableCheckpoint(**components).load(path, map_location=device)
+        try:
+            DurableCheckpoint(**components).load(path, map_location=device)
+        except CheckpointError as error:
+            raise CheckpointError(
+                f"{path} does not fit; it must be loaded with the settings that it was made with.\n{error}"
+            ) from error
 
     def newest(self) -> Path | None:
-        """The newest checkpoint that is whole; a warning tells of damaged ones that were passed over."""
-        for path in reversed(self._rotation.checkpoints()):
+        """The newest checkpoint that is whole, ``None`` if there are none at all.
+
+        A warning tells of damaged ones that were passed over.
+
+        Raises:
+            CheckpointError: if there are some and all are damaged.
+        """
+        newest = next(self._whole(), None)
+        if newest is None and self._paths():
+            raise CheckpointError(
+                f"no checkpoint in {self.directory} can be loaded; remove that folder to start from the beginning."
+            )
+        return newest
+
+    def best(self) -> Path | None:
+        """The whole checkpoint with the best score, or the newest if none has one."""
+        return max(self._whole(), key=_score, default=None) or self.newest()
+
+    def go_back_to(self, step: int) -> None:
+        """Removes later checkpoints, as their steps will be done again, and damaged ones, which would count as kept."""
+        kept = {path for path in self._whole() if _step(path) <= step}
+        for path in self._paths():
+            if path not in kept:
+                _remove(path.rename(path.with_name(f".{path.name}.delete")))
+
+    def _paths(self) -> list[Path]:
+        """Folders named like checkpoints, the newest first."""
+        folders = self.directory.glob(f"{PREFIX}[0-9]*")
+        return sorted((path for path in folders if _step(path) >= 0 and path.is_dir()), key=_step, reverse=True)
+
+    def _whole(self) -> Iterator[Path]:
+        """Undamaged checkpoints, the newest first."""
+        for path in self._paths():
             try:
                 verify(path)
             except CheckpointError as error:
-                warnings.warn(f"{error} The one before it is taken.", stacklevel=2)
+                warnings.warn(f"{error} It is passed over.", stacklevel=3)
             else:
-                return path
-        return None
-
-    def best(self) -> Path | None:
-        """The checkpoint with the best score, or the newest if none has one."""
-        best = self._rotation.best()
-        if best is None or Checkpoint.manifest(best)["metadata"][SCORE] == _UNSCORED:
-            return self.newest()
-        return best
+                yield path
 
     def clean_up(self) -> None:
         """Removes what killed writes left behind. Call it when no other process writes here."""
-        for orphan in self.directory.glob(".checkpoint-*"):
+        for orphan in self.directory.glob(f".{PREFIX}*"):
             name, _, kind = orphan.name[1:].rpartition(".")
             if kind.startswith("backup-") and not (self.directory / name).exists():
                 orphan.rename(self.directory / name)  # killed between the two renames of a replacement
-            elif orphan.is_dir():
-                shutil.rmtree(orphan)
             else:
-                orphan.unlink()
+                _remove(orphan)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+
+
+def _step(path: Path) -> int:
+    """The step in a checkpoint's name; -1 for other names."""
+    number = path.name.removeprefix(PREFIX)
+    return int(number) if number.isdecimal() else -1
+
+
+def _score(path: Path) -> float:
+    metadata = Checkpoint.manifest(path).get("metadata")
+    score = metadata.get(SCORE) if isinstance(metadata, dict) else None
+    return score if isinstance(score, float) else _UNSCORED
 
 
 def verify(path: Path) -> None:
@@ -179,16 +227,25 @@ def verify(path: Path) -> None:
     """
     try:
         sums = json.loads((path / CHECKSUMS).read_text())
-        if not isinstance(sums, dict) or not {"manifest.json"} <= set(sums):
+        if not isinstance(sums, dict) or "manifest.json" not in sums:
             raise ValueError("it lists no files")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise CheckpointError(f"{path} is not a checkpoint of this package ({CHECKSUMS}: {error}).") from error
     for name, expected in sums.items():
         file = path / name
+        if not file.resolve().is_relative_to(path.resolve()):
+            raise CheckpointError(f"{path} is not a checkpoint of this package: {name} lies outside of it.")
         if not file.is_file():
             raise CheckpointError(f"{path} is not complete: {name} is missing.")
         if _checksum(file) != expected:
             raise CheckpointError(f"{path} is damaged: {name} is not what was written.")
+    try:
+        records = Checkpoint.manifest(path)["components"].values()
+    except (CheckpointError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{path} is not a checkpoint of this package (manifest.json: {error}).") from error
+    for record in records:
+        if not {f"{record['path']}/{name}" for name in record["files"]} <= set(sums):
+            raise CheckpointError(f"{path} is not complete: {CHECKSUMS} lacks files of {record['path']}.")
 
 
 def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
@@ -203,14 +260,14 @@ def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None
         ValueError: if there is none, it is damaged, or it does not fit.
     """
     checkpoints = Checkpoints(directory)
-    path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
-    if path is None:
-        raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
-    if path.is_file():
-        load_weights(policy, path)
-        return
     try:
-        checkpoints.load({"policy": policy}, path)
+        path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
+        if path is None:
+            raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
+        if path.is_file():
+            load_weights(policy, path)
+        else:
+            checkpoints.load({"policy": policy}, path)
     except CheckpointError as error:
         raise ValueError(f"checkpoint can't be loaded: {error}") from error
 

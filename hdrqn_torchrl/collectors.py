@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from torchrl.collectors import Collector
@@ -30,7 +31,7 @@ class ResumableCollector(Collector):
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
-        if not self._base_env.state_dict():
+        if _is_empty(self._base_env.state_dict()):
             raise ValueError(
                 f"the environment must return its state from state_dict(), got nothing from {type(self._base_env)}; "
                 "implement state_dict and load_state_dict, or use torchrl.collectors.Collector without checkpoints."
@@ -54,3 +55,8 @@ class ResumableCollector(Collector):
         self._carrier = state_dict["carrier"].clone()
         if self._carrier_has_no_device:
             self._carrier.clear_device_()
+
+
+def _is_empty(state: Mapping[str, Any]) -> bool:
+    """Whether a state, or that of each of several environments, holds nothing."""
+    return all(isinstance(part, Mapping) and _is_empty(part) for part in state.values())

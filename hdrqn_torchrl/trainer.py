@@ -14,7 +14,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import BaseCollector
@@ -112,9 +111,8 @@ class Trainer:
             self.save()
             raise
         except NonFiniteError as error:
-            newest = None if self.checkpoints is None else self.checkpoints.newest()
-            left = f"The last good checkpoint is {newest}." if newest else "There is no checkpoint."
-            raise NonFiniteError(f"{error}; training stopped before it could reach the weights. {left}") from error
+            left = "nothing was saved" if self.checkpoints is None else self.checkpoints.last_good()
+            raise NonFiniteError(f"{error}; training stopped before it could reach the weights; {left}.") from error
 
     def step(self, batch: TensorDictBase) -> None:
         """One iteration on a collected batch ``[N, T]``."""
@@ -138,7 +136,7 @@ class Trainer:
         for name, learner in self.algorithm.learners.items():
             for _ in range(learner.updates_due()):
                 self._stop.check()
-                self._window.add_update(name, learner.update(learner.sample()))
+                self._update(name)
         self.collector.update_policy_weights_()
         before, best = self._completed, False
         if before != self.frames:
@@ -150,6 +148,14 @@ class Trainer:
         if before is not None and (best or late or crossed(before, self.frames, self.checkpoint_frames)):
             self.save(score=self.best_return if best else None)
         self._stop.check()
+
+    def _update(self, name: str) -> None:
+        learner = self.algorithm.learners[name]
+        try:
+            metrics = learner.update(learner.sample())
+        except NonFiniteError as error:
+            raise NonFiniteError(f"{name}: {error}") from error
+        self._window.add_update(name, metrics)
 
     def _due(self, interval: int) -> bool:
         """Whether a multiple of ``interval`` was passed in this iteration; at the very beginning, too."""
@@ -193,7 +199,7 @@ class Trainer:
             self._saved_at, self._saved_position = time.monotonic(), self._position
 
     def resume(self, path: Path) -> None:
-        """Restores everything from a checkpoint; :meth:`train` then goes on from there.
+        """Restores everything from a checkpoint; :meth:`train` then goes on from there, and later ones are removed.
 
         Raises:
             CheckpointError: if the checkpoint is damaged or of another kind of training.
@@ -201,6 +207,7 @@ class Trainer:
         assert self.checkpoints is not None
         device = next(self.algorithm.policy.parameters()).device
         self.checkpoints.load(self._components(), path, device=device)
+        self.checkpoints.go_back_to(self.frames)
         self.collector.update_policy_weights_()
         self._saved_at, self._saved_position = time.monotonic(), self._position
 
@@ -246,18 +253,21 @@ def crossed(before: int, after: int, interval: int) -> bool:
 
 
 def check_finite(batch: TensorDictBase, frames: int) -> None:
-    """Refuses a collected batch with a NaN or an infinity in it, the observation first.
+    """Refuses a collected batch ``[N, T]`` with a NaN or an infinity in it.
 
     Raises:
-        NonFiniteError: naming the entry and the place.
+        NonFiniteError: naming the place and the entry that came first; others follow from it.
     """
-    entries = [(key, value) for key, value in batch.items(True, True) if value.is_floating_point()]
-    entries.sort(key=lambda entry: keys.OBSERVATION not in entry[0])
-    for key, value in entries:
-        if not torch.isfinite(value).all():
-            name = ".".join(key) if isinstance(unravel_key(key), tuple) else key
-            row = (~torch.isfinite(value.flatten(1, -1) if value.ndim > 1 else value)).nonzero()[0, 0].item()
-            raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {row}, after frame {frames}")
+    found = []
+    for key, value in batch.items(True, True):
+        if value.is_floating_point() and not torch.isfinite(value).all():
+            wrong = ~torch.isfinite(value).reshape(*batch.shape, -1).all(-1)
+            time, environment = wrong.t().nonzero()[0].tolist()
+            name = ".".join(key) if isinstance(key, tuple) else key
+            found.append((time, *(cause not in name for cause in (keys.OBSERVATION, keys.REWARD)), name, environment))
+    if found:
+        *_, name, environment = min(found)
+        raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")
 
 
 class _Window:

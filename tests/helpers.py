@@ -2,17 +2,32 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import random
+from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
+import numpy
 import torch
+from rich.console import Console
+from safetensors.torch import load_file
 from tensordict import TensorDictBase
+from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
-from hdrqn_torchrl.algorithms import Algorithm, make_dqn, make_drqn, make_hdqn, make_hdrqn
+from hdrqn_torchrl.algorithms import Algorithm, make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3
+from hdrqn_torchrl.checkpoint import Checkpoints
+from hdrqn_torchrl.collectors import ResumableCollector
 from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.evaluation import evaluate
 from hdrqn_torchrl.learner import LearnerSettings
-from hdrqn_torchrl.modules import compact_network
+from hdrqn_torchrl.logging import RunLogger
+from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
+from hdrqn_torchrl.trainer import Trainer
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 torch.set_num_threads(1)
@@ -24,6 +39,7 @@ AGENT, OBJECTS = torch.tensor([7]), torch.tensor([[8, 9, 10]])
 LEFT, RIGHT = 2, 3
 
 ALGORITHMS = ("dqn", "drqn", "hdqn", "v1", "v2")
+CLOCK = ("wall_seconds", "frames_per_second", "updates_per_second")
 
 
 def small_env(num_envs: int = 4, **settings) -> MultiGoalGridEnv:
@@ -45,19 +61,24 @@ def tiny_settings(**changes) -> LearnerSettings:
 
 
 def build(name: str, env: MultiGoalGridEnv, architecture=None, *, settings=None, **options) -> Algorithm:
-    """One of the five algorithms with small networks and quick learners."""
+    """One of the algorithms with small networks and quick learners."""
     architecture = architecture or compact_network(8, (8,))
     settings = settings or tiny_settings()
     if name in ("dqn", "drqn"):
         return {"dqn": make_dqn, "drqn": make_drqn}[name](env, architecture, learner=settings, **options)
     if name == "hdqn":
         return make_hdqn(env, architecture, sub=settings, meta=settings, **options)
+    if name == "v3":
+        settings = replace(settings, sampling="episode_starts")
+        return make_v3(env, architecture, learner=settings, memory_size=8, head_size=8, **options)
     return make_hdrqn(env, architecture, version=name, sub=settings, meta=settings, **options)
 
 
-def make_collector(algorithm: Algorithm, env: MultiGoalGridEnv, steps: int, total_frames: int = -1) -> Collector:
+def make_collector(
+    algorithm: Algorithm, env: MultiGoalGridEnv, steps: int, total_frames: int = -1, kind: type = Collector
+) -> Collector:
     """Collects batches ``[N, steps]``."""
-    return Collector(
+    return kind(
         algorithm.transform(env),
         algorithm.policy,
         frames_per_batch=env.batch_size[0] * steps,
@@ -72,6 +93,94 @@ def collect(algorithm: Algorithm, env: MultiGoalGridEnv, steps: int, batches: in
     taken = [batch.clone() for batch, _ in zip(collector, range(batches), strict=False)]
     collector.shutdown()
     return taken
+
+
+def make_training(
+    folder: Path,
+    name: str = "v2",
+    *,
+    seed: int = 0,
+    learner: dict | None = None,
+    options: dict | None = None,
+    **settings,
+) -> Trainer:
+    """A whole training with real parts, so small that its memories wrap and dozens of episodes end in 256 frames.
+
+    Args:
+        folder: run folder.
+        name: the algorithm.
+        seed: of its networks and worlds.
+        learner: changes to the learners' settings.
+        options: more arguments of the algorithm.
+        settings: changes to the trainer's settings.
+    """
+    torch.manual_seed(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    env = small_env(4, seed=seed)
+    levels = ("exploration",) if name in ("dqn", "drqn") else ("sub_exploration", "meta_exploration")
+    parts: dict = {level: EpsilonGreedy(1.0, 0.1, anneal_frames=300) for level in levels}
+    if name == "v3":
+        parts["sub_exploration"] = RepeatingEpsilonGreedy(1.0, 0.1, anneal_frames=300)
+    if len(levels) > 1:
+        parts["max_option_steps"] = 3  # several options an episode
+    quick = {"capacity": 40, "frames_per_update": 8, "warmup_frames": 64, "learning_rate": 1e-2}
+    algorithm = build(name, env, settings=tiny_settings(**(quick | (learner or {}))), **parts, **(options or {}))
+    evaluation_env = algorithm.transform(small_env(8))
+    defaults = {"total_frames": 256, "log_frames": 96, "evaluation_frames": 128, "checkpoint_frames": 1_000_000}
+    settings = defaults | {"checkpoints": Checkpoints(folder / "checkpoints")} | settings
+    total_frames = settings["total_frames"]
+    return Trainer(
+        algorithm,
+        make_collector(algorithm, env, 8, total_frames, ResumableCollector),
+        logger=RunLogger(folder, total_frames=total_frames, console=Console(file=io.StringIO())),
+        evaluate=lambda: evaluate(evaluation_env, algorithm.policy, episodes=8),
+        **settings,
+    )
+
+
+def table(folder: Path) -> list[dict[str, str]]:
+    """Rows of a run's ``metrics.csv`` without the columns that depend on the clock."""
+    with (folder / "metrics.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    return [{name: value for name, value in row.items() if not name.endswith(CLOCK)} for row in rows]
+
+
+def contents(folder: Path) -> dict:
+    """Everything in the newest checkpoint of a run but the clock: parts of the structure, and bytes of tensors."""
+    newest = max((folder / "checkpoints").iterdir())
+    found: dict = {"step": newest.name, "score": Checkpoint.manifest(newest)["metadata"]}
+    for part in (newest / "components").iterdir():
+        found[part.name] = _without_clock(json.loads((part / "structure.json").read_text()))
+        for name, tensor in load_file(part / "tensors.safetensors").items():
+            found[part.name, name] = tensor.dtype, tuple(tensor.shape), tensor.numpy().tobytes()
+    return found
+
+
+def _without_clock(node):
+    if isinstance(node, list):
+        is_clock = len(node) == 2 and node[0] in ("wall_seconds", "seconds")
+        return node[:1] if is_clock else [_without_clock(item) for item in node]
+    return {key: _without_clock(item) for key, item in node.items()} if isinstance(node, dict) else node
+
+
+def check_same(folder: Path, reference: Path) -> None:
+    """Compares two runs whole, with no tolerance."""
+    check_same_checkpoint(folder, reference)
+    assert table(folder) == table(reference)
+
+
+def check_same_checkpoint(folder: Path, reference: Path) -> None:
+    """Compares the newest checkpoints of two runs whole, with no tolerance."""
+    found, expected = contents(folder), contents(reference)
+    assert found.keys() == expected.keys() and len(found) > 50
+    assert [key for key in found if found[key] != expected[key]] == []
+
+
+def seed_everything(seed: int) -> None:
+    """All global random generators."""
+    random.seed(seed)
+    numpy.random.seed(seed)
+    torch.manual_seed(seed)
 
 
 @cache

@@ -1,11 +1,13 @@
+from copy import deepcopy
+
 import pytest
 import torch
-from helpers import ALGORITHMS, build, collect, make_collector, small_env, tiny_settings
+from helpers import ALGORITHMS, build, collect, make_collector, parameter_distance, small_env, tiny_settings
 from torchrl.envs.utils import check_env_specs
 
-from hdrqn_torchrl.algorithms import make_hdqn, make_hdrqn
+from hdrqn_torchrl.algorithms import V3_LEARNER, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.modules import EpsilonGreedy, compact_network, paper_network
+from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
 
 NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
 
@@ -23,6 +25,7 @@ NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
         ("v2", {"meta_input": "cell"}),
         ("v2", {"meta_input": "both"}),
         ("v2", {"meta_input_time": "after_last_observation"}),
+        ("v3", {}),
     ],
     ids=lambda value: value if isinstance(value, str) else "-".join(value.values()),
 )
@@ -30,8 +33,9 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
     torch.manual_seed(0)
     env = MultiGoalGridEnv(4, layout=layout, max_steps=6, seed=0)
     algorithm = build(name, env, NETWORKS[network], settings=tiny_settings(batch_size=16), **options)
-    assert list(algorithm.learners) == (["flat"] if name in ("dqn", "drqn") else ["sub", "meta"])
-    assert list(algorithm.explorations) == list(algorithm.learners)
+    learners = {"dqn": ["flat"], "drqn": ["flat"], "v3": ["joint"]}
+    assert list(algorithm.learners) == learners.get(name, ["sub", "meta"])
+    assert list(algorithm.explorations) == (["sub", "meta"] if name == "v3" else list(algorithm.learners))
     batch = collect(algorithm, env, 8)[0]
     for learner in algorithm.learners.values():
         before = [p.detach().clone() for p in learner.network.parameters()]
@@ -41,13 +45,13 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
         assert any((p != old).any() for p, old in zip(learner.network.parameters(), before, strict=True))
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])
 def test_the_environment_as_the_algorithm_sees_it_keeps_its_specs(name):
     env = small_env(3)
     check_env_specs(build(name, env).transform(env))
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
+@pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])
 def test_the_policy_is_made_of_what_the_learners_train(name):
     algorithm = build(name, small_env(3))
     trained = {id(p) for learner in algorithm.learners.values() for p in learner.network.parameters()}
@@ -243,20 +247,157 @@ def test_short_options_and_short_episodes_are_trained():
     assert result["trained_steps"] >= real[starts].sum() > 0
 
 
-def test_two_algorithms_share_nothing():
-    first, second = (build("v2", small_env(2)) for _ in range(2))
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_two_algorithms_share_nothing(name):
+    first, second = (build(name, small_env(2)) for _ in range(2))
     ids = [{id(t) for t in [*a.policy.parameters(), *a.policy.buffers()]} for a in (first, second)]
     assert not ids[0] & ids[1]
-    assert first.learners["sub"].buffer is not second.learners["sub"].buffer
+    for one, other in zip(first.learners.values(), second.learners.values(), strict=True):
+        assert one.buffer is not other.buffer
 
 
-def test_a_collector_carries_options_and_states_from_batch_to_batch():
+V2_STATES = ("sub_hidden", "meta_hidden")
+V3_STATES = ("memory_hidden", "memory_cell", "previous_action", "repeated_action")
+
+
+@pytest.mark.parametrize(("name", "states"), [("v2", V2_STATES), ("v3", V3_STATES)])
+def test_a_collector_carries_options_and_states_from_batch_to_batch(name, states):
     torch.manual_seed(0)
     env = small_env(4)
-    collector = make_collector(build("v2", env), env, 3)
+    collector = make_collector(build(name, env), env, 3)
     first, second = (batch.clone() for batch, _ in zip(collector, range(2), strict=False))
     collector.shutdown()
     going_on = ~first["next", "done"][:, -1].squeeze(-1)
     assert going_on.any()
-    for key in ("sub_hidden", "meta_hidden", "option_return", "option_steps", "active_subgoal", "option_init"):
+    for key in (*states, "option_return", "option_steps", "active_subgoal", "option_init"):
         assert (second[key][:, 0] == first["next", key][:, -1])[going_on].all(), key
+
+
+class TestV3:
+    def make(self, env=None, *, learner=None, **options):
+        torch.manual_seed(0)
+        settings = tiny_settings(**({"sampling": "episode_starts", "batch_size": 16} | (learner or {})))
+        return make_v3(env or small_env(8), NETWORKS["compact"], learner=settings, **options)
+
+    def steps(self, **options):
+        env = small_env(8)
+        algorithm = self.make(env, **options)
+        return algorithm, collect(algorithm, env, 40)[0]
+
+    def test_one_update_moves_every_part_and_the_target_follows(self):
+        algorithm, batch = self.steps(learner={"tau": 0.25, "learning_rate": 0.1})
+        learner, network = algorithm.learners["joint"], algorithm.policy.network
+        learner.store(batch)
+        before = {name: p.detach().clone() for name, p in network.named_parameters()}
+        metrics = learner.update(learner.sample())
+        target = learner.loss.target_policy_params["network"].flatten_keys(".")
+        for name, parameter in network.named_parameters():
+            moved = (parameter - before[name]).abs().max().item()
+            assert moved > 0 or name.startswith("memory.bias_hh"), name
+            torch.testing.assert_close(target[name], before[name].lerp(parameter.detach(), 0.25), msg=name)
+        assert not any(value.requires_grad for value in metrics.values())
+        assert set(metrics) == set(learner.loss.out_keys)
+
+    def test_a_sequence_has_one_step_more_than_are_trained(self):
+        algorithm, batch = self.steps(learner={"slice_len": 5, "batch_size": 3})
+        learner = algorithm.learners["joint"]
+        learner.store(batch)
+        assert learner.sample().shape == (3, 6)
+
+    def test_what_is_stored(self):
+        """Nothing twice: no next observation, no recurrent state."""
+        algorithm, batch = self.steps()
+        stored = algorithm.learners["joint"].extract(batch)
+        ends = {("next", key) for key in ("done", "terminated", "truncated")} | {("collector", "traj_ids")}
+        assert set(stored.keys(True, True)) == ends | {
+            "observation",
+            "previous_action",
+            "action",
+            "is_init",
+            "option_init",
+            "subgoal_mask",
+            ("next", "attained"),
+            ("next", "hazard"),
+            ("next", "extrinsic_reward"),
+            ("next", "active_subgoal"),
+        }
+        assert all((stored[key] == batch[key]).all() for key in stored.keys(True, True))
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("sub_gamma", 0.5),
+            ("meta_gamma", 0.5),
+            ("trace_decay", 0.25),
+            ("all_subgoals", False),
+            ("intra_option", False),
+            ("wrong_subgoal_reward", -0.25),
+            ("hazard_reward", -0.75),
+            ("max_meta_target", 2.0),
+        ],
+    )
+    def test_options_of_the_loss(self, name, value):
+        default, changed = (self.make(**options).learners["joint"].loss for options in ({}, {name: value}))
+        assert getattr(default, name) != getattr(changed, name) == value
+
+    def test_double(self):
+        for double in (True, False):
+            assert self.make(learner={"double": double}).learners["joint"].loss.double == double
+
+    def test_options_of_the_network(self):
+        algorithm = self.make(memory_size=9, head_size=7, joint=False)
+        network = algorithm.policy.network
+        assert (network.hidden_size, network.sub_head[0].out_features, network.joint) == (9, 7, False)
+        assert self.make().policy.network.joint
+        assert (network.num_actions, network.num_subgoals) == (4, 2)
+
+    def test_rewards_and_discount_reach_the_option_book(self):
+        _, batch = self.steps(wrong_subgoal_reward=-0.25, hazard_reward=-0.75, meta_gamma=0.5)
+        assert batch["next", "intrinsic_reward"].unique().tolist() == [-0.75, -0.25, 0.0, 1.0]
+        late = batch["next", "subgoal_reached"] & (batch["next", "option_steps"] == 3)
+        assert 0.25 in batch["next", "option_return"][late].tolist()  # a goal in order in the third step
+
+    def test_max_option_steps(self):
+        for limit in (None, 3):
+            _, batch = self.steps(max_option_steps=limit)
+            assert batch["next", "option_steps"].max() == (limit or 7)
+
+    def test_schedules_reach_their_level(self):
+        sub, meta = RepeatingEpsilonGreedy(0.5, 0.5), EpsilonGreedy(0.25, 0.25)
+        algorithm = self.make(sub_exploration=sub, meta_exploration=meta)
+        assert algorithm.policy.sub_exploration is algorithm.explorations["sub"] is sub
+        assert algorithm.policy.meta_exploration is algorithm.explorations["meta"] is meta
+        default = self.make()
+        assert isinstance(default.explorations["sub"], RepeatingEpsilonGreedy)
+        assert not isinstance(default.explorations["meta"], RepeatingEpsilonGreedy)
+        assert default.explorations["sub"] is not self.make().explorations["sub"]
+
+    def test_single_random_steps_need_nothing_carried(self):
+        _, batch = self.steps(sub_exploration=EpsilonGreedy(0.5, 0.5))
+        assert "repeated_action" not in batch and "repeated_action" not in batch["next"]
+
+    @pytest.mark.parametrize("sampling", ["steps", "episodes"])
+    def test_other_sampling_is_refused(self, sampling):
+        with pytest.raises(ValueError, match=f"sampling must be 'episode_starts' for v3, got '{sampling}': "):
+            self.make(learner={"sampling": sampling})
+
+    def test_the_default_learner(self):
+        assert V3_LEARNER.sampling == "episode_starts"
+        algorithm = make_v3(small_env(2), NETWORKS["compact"])
+        assert algorithm.learners["joint"].settings is V3_LEARNER
+
+    def test_a_restored_learner_goes_on_alike(self):
+        algorithm, batch = self.steps()
+        first, second = algorithm.learners["joint"], self.make().learners["joint"]
+        first.store(batch[:, :20])
+        second.store(batch[:, 20:])
+        for learner in (first, second):
+            learner.update(learner.sample())
+        second.load_state_dict(deepcopy(first.state_dict()))  # torch's optimiser keeps what it is given
+        for learner in (first, second):
+            torch.manual_seed(1)
+            learner.store(batch[:, 20:])
+            for _ in range(2):
+                learner.update(learner.sample())
+        assert parameter_distance(first.loss.policy_params.data, second.loss.policy_params.data) == 0
+        assert parameter_distance(first.loss.target_policy_params, second.loss.target_policy_params) == 0

@@ -1,9 +1,20 @@
+import io
+import json
+import os
+import pickle
+import re
+import shutil
+import zlib
+from pathlib import Path
+
 import pytest
 import torch
-from helpers import build, small_env
+from helpers import build, make_training, small_env
+from tensordict import TensorDict
 from torch import nn
+from torchrl.checkpoint import Checkpoint, CheckpointError
 
-from hdrqn_torchrl.checkpoint import load_weights, save_weights
+from hdrqn_torchrl.checkpoint import Checkpoints, load_policy, load_weights, save_weights, verify
 
 
 def test_a_policy_comes_back_with_its_weights_and_schedules(tmp_path):
@@ -75,3 +86,514 @@ class TestFilesThatDoNotFit:
     def test_a_missing_file(self, tmp_path):
         with pytest.raises(ValueError, match=r"path must name a weights file, got .*nothing\.safetensors; "):
             load_weights(nn.Linear(2, 2), tmp_path / "nothing.safetensors")
+
+
+class State:
+    """A component that is nothing but its state."""
+
+    def __init__(self, state=None):
+        self.state = state
+
+    def state_dict(self):
+        return self.state
+
+    def load_state_dict(self, state):
+        self.state = state
+
+
+def round_trip(state, folder):
+    checkpoints, copy = Checkpoints(folder / "checkpoints"), State()
+    checkpoints.load({"part": copy}, checkpoints.save({"part": State(state)}, step=1))
+    return copy.state
+
+
+class TestWhatAStateMayHold:
+    @pytest.mark.parametrize(
+        "state",
+        [
+            None,
+            True,
+            -3,
+            0.1 + 0.2,
+            float("inf"),
+            "text",
+            [],
+            {},
+            (),
+            [1, [2.5, "x"], (None, False)],
+            {"a": {"b": {}}, 0: "zero", 1: {2: [3]}},
+            {"size": torch.Size([2, 3]), "tuple": (2, 3), "list": [2, 3]},
+            {"a/b": 1, "a": {"b": 2}},
+            2**70,
+        ],
+        ids=repr,
+    )
+    def test_plain_values_come_back_with_their_types(self, tmp_path, state):
+        found = round_trip(state, tmp_path)
+        assert found == state and repr(found) == repr(state)
+
+    @pytest.mark.parametrize(
+        "tensor",
+        [
+            torch.randn(3, 4),
+            torch.tensor(2.5),
+            torch.zeros(0, 3),
+            torch.zeros(0, dtype=torch.int64),
+            torch.tensor([True, False]),
+            torch.tensor([[255]], dtype=torch.uint8),
+            torch.tensor([-(2**40)]),
+            torch.randn(2, dtype=torch.float64),
+            torch.randn(2).to(torch.bfloat16),
+            torch.arange(12).view(3, 4).t(),
+            torch.arange(4).expand(3, 4),
+            torch.tensor([float("nan"), float("inf"), -0.0]),
+            nn.Parameter(torch.ones(2)),
+        ],
+        ids=lambda tensor: f"{tensor.dtype}-{tuple(tensor.shape)}".replace("torch.", ""),
+    )
+    def test_tensors_come_back_bit_for_bit(self, tmp_path, tensor):
+        found = round_trip({"tensor": tensor}, tmp_path)["tensor"]
+        assert (found.dtype, found.shape, found.requires_grad) == (tensor.dtype, tensor.shape, False)
+        wanted = tensor.detach().contiguous()
+        assert (found.view(torch.uint8) if found.ndim else found).equal(
+            wanted.view(torch.uint8) if found.ndim else wanted
+        )
+
+    def test_tensors_that_share_memory_come_back_apart(self, tmp_path):
+        whole = torch.arange(6.0)
+        found = round_trip([whole, whole, whole[2:4], whole.view(2, 3)], tmp_path)
+        assert [each.tolist() for each in found] == [
+            [0, 1, 2, 3, 4, 5],
+            [0, 1, 2, 3, 4, 5],
+            [2, 3],
+            [[0, 1, 2], [3, 4, 5]],
+        ]
+        found[0].fill_(-1)
+        assert found[1].tolist() == [0, 1, 2, 3, 4, 5]
+
+    def test_what_came_back_does_not_depend_on_the_file(self, tmp_path):
+        found = round_trip({"tensor": torch.ones(1000)}, tmp_path)["tensor"]
+        for file in tmp_path.rglob("*.safetensors"):
+            file.write_bytes(bytes(file.stat().st_size))
+        found += 1
+        assert (found == 2).all()
+
+    def test_tensordicts_come_back_with_batch_size_and_names(self, tmp_path):
+        state = TensorDict({"a": torch.ones(2, 3, 1), "in": {"b": torch.zeros(2, 3, dtype=torch.bool)}}, [2, 3])
+        state.names = [None, "time"]
+        plain = TensorDict({("next", "c"): torch.arange(0)}, [0])
+        found, found_plain = round_trip([state, plain], tmp_path)
+        assert found.batch_size == state.batch_size == found["in"].batch_size and found.names == [None, "time"]
+        assert (found == state).all() and set(found.keys(True, True)) == {"a", ("in", "b")}
+        assert found_plain.batch_size == plain.batch_size and found_plain["next", "c"].dtype == torch.int64
+
+    def test_a_generator_goes_on_where_it_was(self, tmp_path):
+        generator = torch.Generator().manual_seed(3)
+        torch.rand(5, generator=generator)
+        state = round_trip(generator.get_state(), tmp_path)
+        expected = torch.rand(5, generator=generator)
+        generator.set_state(state)
+        assert torch.rand(5, generator=generator).equal(expected)
+
+    @pytest.mark.parametrize(
+        "value", [{1, 2}, b"bytes", object(), torch.float32, lambda: 0], ids=lambda v: str(type(v))
+    )
+    def test_anything_else_is_refused_by_its_place(self, tmp_path, value):
+        checkpoints = Checkpoints(tmp_path)
+        with pytest.raises(TypeError, match=r"a state may hold tensors, numbers, .*at inner/0\."):
+            checkpoints.save({"part": State({"inner": [value]})}, step=1)
+        assert not list(tmp_path.iterdir())
+
+
+class TestDurability:
+    def test_every_file_is_on_the_disk_before_the_checkpoint_has_its_name(self, tmp_path, monkeypatch):
+        """In this order: all files and folders of the stage, the rename, the folder that holds the name."""
+        events = []
+
+        def synced(descriptor):
+            events.append(("fsync", Path(f"/proc/self/fd/{descriptor}").readlink()))
+
+        def replaced(source, target):
+            events.append(("replace", Path(target)))
+            replace(source, target)
+
+        replace = os.replace
+        monkeypatch.setattr(os, "fsync", synced)
+        monkeypatch.setattr(os, "replace", replaced)
+        path = Checkpoints(tmp_path).save({"a": nn.Linear(1, 1), "b": State({"x": 1})}, step=5)
+        names = [kind for kind, _ in events]
+        at = names.index("replace")
+        assert events[at] == ("replace", path) and names.count("replace") == 1
+        assert events[at + 1 :] == [("fsync", tmp_path)]
+        stage = events[0][1]
+        synced_before = {each.relative_to(stage).as_posix() for _, each in events[:at]}
+        written = {each.relative_to(path).as_posix() for each in [path, *path.rglob("*")]}
+        assert stage.parent == tmp_path and synced_before == written and len(written) == 10
+
+    def test_a_module_can_be_loaded_by_name_from_a_checkpoint_with_more_in_it(self, tmp_path):
+        checkpoints, copy = Checkpoints(tmp_path), nn.Linear(2, 2)
+        source = nn.Linear(2, 2)
+        path = checkpoints.save({"policy": source, "rest": State(3)}, step=1)
+        checkpoints.load({"policy": copy}, path)
+        assert (copy.weight == source.weight).all()
+
+
+class TestRetention:
+    def save(self, checkpoints, *entries):
+        for entry in entries:
+            step, score = entry if isinstance(entry, tuple) else (entry, None)
+            checkpoints.save({"part": State(step)}, step=step, score=score)
+        return sorted(int(path.name.removeprefix("checkpoint-")) for path in checkpoints.directory.iterdir())
+
+    def test_the_newest_and_the_best_are_kept(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path)
+        assert self.save(checkpoints, 10, (20, 0.5), (30, 0.2), 40, 50, 60) == [20, 50, 60]
+        assert (checkpoints.best().name[-2:], checkpoints.newest().name[-2:]) == ("20", "60")
+        assert self.save(checkpoints, (70, 0.9), 80, 90, 100) == [70, 90, 100]
+
+    def test_as_many_as_asked_for(self, tmp_path):
+        assert self.save(Checkpoints(tmp_path, keep_last=4), *range(0, 100, 10)) == [60, 70, 80, 90]
+        with pytest.raises(ValueError, match="keep_last must be >= 2, got 1; "):
+            Checkpoints(tmp_path, keep_last=1)
+
+    def test_without_scores_the_newest_is_the_best(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path)
+        self.save(checkpoints, 10, 20)
+        assert checkpoints.best() == checkpoints.newest()
+
+    def test_of_equal_scores_and_of_negative_ones(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path, keep_last=5)
+        self.save(checkpoints, (10, -2.0), (20, -1.0), (30, -1.0), 40)
+        assert checkpoints.best().name.endswith("30")
+
+    def test_a_step_saved_twice_is_replaced(self, tmp_path):
+        checkpoints, copy = Checkpoints(tmp_path), State()
+        self.save(checkpoints, 10)
+        path = checkpoints.save({"part": State("new")}, step=10)
+        checkpoints.load({"part": copy}, path)
+        assert copy.state == "new" and [each.name for each in tmp_path.iterdir()] == [path.name]
+
+    def test_an_empty_or_missing_folder_has_none(self, tmp_path):
+        for folder in (tmp_path, tmp_path / "missing"):
+            assert Checkpoints(folder).newest() is None and Checkpoints(folder).best() is None
+            Checkpoints(folder).clean_up()
+
+    def test_going_back_removes_what_came_later(self, tmp_path):
+        """Else it would be kept in place of what is saved from now on."""
+        checkpoints = Checkpoints(tmp_path, keep_last=3)
+        self.save(checkpoints, 10, 20, (30, 1.0))
+        checkpoints.go_back_to(10)
+        assert self.save(checkpoints, 15) == [10, 15]
+
+
+def make_folder(path, files=("manifest.json",)):
+    path.mkdir(parents=True)
+    for name in files:
+        (path / name).write_text("half")
+    return path
+
+
+class TestCleanUp:
+    def test_what_killed_writes_left_is_removed(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path)
+        good = checkpoints.save({"part": State(1)}, step=10)
+        make_folder(tmp_path / ".checkpoint-000000000020.stage-0123abcd")
+        make_folder(tmp_path / ".checkpoint-000000000010.delete-0123abcd")
+        make_folder(tmp_path / ".checkpoint-000000000010.backup-0123abcd")  # its replacement has the name already
+        (tmp_path / ".checkpoint-000000000030.archive-0123abcd").write_text("half")
+        other = make_folder(tmp_path / "mine")
+        checkpoints.clean_up()
+        assert sorted(tmp_path.iterdir()) == [good, other]
+
+    def test_a_replacement_that_was_cut_between_its_two_renames_is_undone(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path)
+        path = checkpoints.save({"part": State("before")}, step=10)
+        path.rename(tmp_path / f".{path.name}.backup-0123abcd")
+        make_folder(tmp_path / f".{path.name}.stage-0123abcd")
+        assert checkpoints.newest() is None
+        checkpoints.clean_up()
+        copy = State()
+        checkpoints.load({"part": copy}, checkpoints.newest())
+        assert copy.state == "before" and list(tmp_path.iterdir()) == [path]
+
+    def test_it_does_not_follow_links(self, tmp_path):
+        precious = make_folder(tmp_path / "precious")
+        (tmp_path / "checkpoints").mkdir()
+        (tmp_path / "checkpoints" / ".checkpoint-1.stage-0").symlink_to(precious)
+        Checkpoints(tmp_path / "checkpoints").clean_up()
+        assert not list((tmp_path / "checkpoints").iterdir()) and list(precious.iterdir())
+
+
+@pytest.fixture(scope="module")
+def two_saved(tmp_path_factory):
+    """Checkpoints of a training at frames 96 and 128."""
+    folder = tmp_path_factory.mktemp("run")
+    make_training(folder, total_frames=128, evaluation_frames=1_000, checkpoint_frames=96).train()
+    return folder / "checkpoints"
+
+
+@pytest.fixture
+def saved(two_saved, tmp_path):
+    """A copy of them to be damaged, and the newest."""
+    shutil.copytree(two_saved, tmp_path / "checkpoints")
+    return Checkpoints(tmp_path / "checkpoints"), tmp_path / "checkpoints" / "checkpoint-000000000128"
+
+
+def files_of(folder):
+    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def flip(file):
+    content = bytearray(file.read_bytes())
+    content[len(content) // 2] ^= 4
+    file.write_bytes(content)
+
+
+DAMAGES = {
+    "missing": lambda file: file.unlink(),
+    "empty": lambda file: file.write_bytes(b""),
+    "half": lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2]),
+    "one byte less": lambda file: file.write_bytes(file.read_bytes()[:-1]),
+    "one bit": flip,
+    "another's": lambda file: file.write_bytes(b"PK\x03\x04 something else"),
+}
+
+
+class TestDamage:
+    @pytest.mark.parametrize("damage", DAMAGES)
+    def test_of_any_file_is_found_and_the_one_before_is_taken(self, saved, damage):
+        checkpoints, newest = saved
+        before, backup = newest.with_name("checkpoint-000000000096"), newest.with_name("backup")
+        names = files_of(newest)
+        assert len(names) == 2 + 2 * 7 and checkpoints.newest() == newest
+        shutil.copytree(newest, backup)
+        for name in names:
+            DAMAGES[damage](newest / name)
+            with pytest.raises(CheckpointError, match=re.escape(str(newest))) as refusal:
+                verify(newest)
+            assert name in str(refusal.value) or name == "checksums.json"
+            with pytest.warns(UserWarning, match=re.escape(f"{newest} is")):
+                assert checkpoints.newest() == before
+            (newest / name).unlink(missing_ok=True)
+            shutil.copyfile(backup / name, newest / name)
+        assert checkpoints.newest() == newest
+
+    def test_a_damaged_best_is_passed_over(self, saved):
+        checkpoints, newest = saved
+        best = checkpoints.save({"part": State(1)}, step=64, score=1.0)
+        assert checkpoints.best() == best
+        (best / "manifest.json").write_text("{}")
+        with pytest.warns(UserWarning, match="is damaged: manifest.json"):
+            assert checkpoints.best() == newest
+
+    def test_if_all_are_damaged_nothing_starts_from_scratch(self, saved):
+        checkpoints, newest = saved
+        for path in newest.parent.iterdir():
+            (path / "manifest.json").unlink()
+        with pytest.warns(UserWarning), pytest.raises(CheckpointError, match=r"no checkpoint in .* can be loaded; "):
+            checkpoints.newest()
+
+    def test_a_training_that_goes_on_from_the_one_before_removes_the_damaged_one(self, saved, tmp_path):
+        checkpoints, newest = saved
+        (newest / "checksums.json").unlink()
+        trainer = make_training(tmp_path, total_frames=128, evaluation_frames=1_000)
+        with pytest.warns(UserWarning):
+            trainer.resume(trainer.checkpoints.newest())
+        assert trainer.frames == 96 and not newest.exists()
+        trainer.train()
+        assert checkpoints.newest() == newest
+
+    @pytest.mark.parametrize("kind", ["folder", "file", "missing", "torchrl", "torch"])
+    def test_what_is_no_checkpoint_is_refused(self, saved, tmp_path, kind):
+        checkpoints, _ = saved
+        path = tmp_path / "foreign"
+        if kind == "folder":
+            make_folder(path)
+        elif kind == "file":
+            path.write_text("text")
+        elif kind == "torchrl":
+            Checkpoint(part=nn.Linear(1, 1)).save(path)
+        elif kind == "torch":
+            torch.save({"weight": torch.ones(1)}, path)
+        with pytest.raises(CheckpointError, match=r"foreign is not a checkpoint of this package \(checksums\.json: "):
+            checkpoints.load({"part": State()}, path)
+
+    def test_one_of_another_training_is_refused(self, saved, tmp_path):
+        _, newest = saved
+        for changes in ({"name": "drqn"}, {"learner": {"capacity": 200}, "name": "v1"}):
+            trainer = make_training(tmp_path / "other", **changes)
+            with pytest.raises(CheckpointError, match="000000128 does not fit; it must be loaded with the settings"):
+                trainer.resume(newest)
+
+
+class Evil:
+    """Its unpickling leaves a mark."""
+
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return Path.touch, (self.marker,)
+
+
+def forge(checkpoint, name, content):
+    """Puts a file into a checkpoint, with a checksum that fits."""
+    (checkpoint / name).parent.mkdir(parents=True, exist_ok=True)
+    (checkpoint / name).write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
+    sums = json.loads((checkpoint / "checksums.json").read_text())
+    data = (checkpoint / name).read_bytes()
+    sums[name] = [len(data), zlib.crc32(data)]
+    (checkpoint / "checksums.json").write_text(json.dumps(sums))
+
+
+def change_manifest(checkpoint, change):
+    manifest = json.loads((checkpoint / "manifest.json").read_text())
+    change(manifest)
+    forge(checkpoint, "manifest.json", manifest)
+
+
+class TestHostileCheckpoints:
+    """Checksums that fit: whoever wrote these meant it."""
+
+    @pytest.fixture
+    def hostile(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path / "checkpoints")
+        return checkpoints, checkpoints.save({"policy": nn.Linear(2, 2)}, step=1)
+
+    def refused(self, checkpoints, path):
+        with pytest.raises(CheckpointError, match=re.escape(str(path))) as refusal:
+            checkpoints.load({"policy": nn.Linear(2, 2)}, path)
+        with pytest.raises(ValueError, match="checkpoint can't be loaded: "):
+            load_policy(nn.Linear(2, 2), checkpoints.directory, str(path))
+        return str(refusal.value)
+
+    def test_a_marker_would_appear_if_anything_were_unpickled(self, tmp_path):
+        pickle.loads(pickle.dumps(Evil(tmp_path / "marker")))
+        assert (tmp_path / "marker").exists()
+
+    @pytest.mark.parametrize("save", ["pickle", "torch"])
+    @pytest.mark.parametrize(
+        "name",
+        ["tensors.safetensors", "structure.json", "state.pt", "../../manifest.json"],
+        ids=lambda name: Path(name).name,
+    )
+    def test_nothing_is_unpickled(self, hostile, tmp_path, save, name):
+        checkpoints, path = hostile
+        buffer = io.BytesIO()
+        (torch.save if save == "torch" else pickle.dump)(Evil(tmp_path / "marker"), buffer)
+        place = os.path.normpath(f"components/0000-policy/{name}")
+        forge(path, place, buffer.getvalue())
+        if name == "state.pt":  # as TorchRL's own adapter reads it
+            change_manifest(
+                path, lambda manifest: manifest["components"]["policy"].update(adapter="torchrl.state_dict")
+            )
+        self.refused(checkpoints, path)
+        assert not (tmp_path / "marker").exists()
+
+    @pytest.mark.parametrize(
+        "manifest",
+        [[], "text", 3, None, {}, {"format": "torchrl.checkpoint"}, {"format": "other", "format_version": 1}],
+        ids=str,
+    )
+    def test_a_manifest_that_is_none(self, hostile, manifest):
+        checkpoints, path = hostile
+        forge(path, "manifest.json", manifest)
+        assert "is not a checkpoint of this package (manifest.json: " in self.refused(checkpoints, path)
+
+    @pytest.mark.parametrize("place", ["../../../elsewhere", "/etc", "components/../../.."])
+    def test_a_manifest_that_leads_elsewhere(self, hostile, place):
+        checkpoints, path = hostile
+        change_manifest(path, lambda manifest: manifest["components"]["policy"].update(path=place))
+        assert "Unsafe archive member path" in self.refused(checkpoints, path)
+
+    def test_checksums_of_files_elsewhere(self, hostile, tmp_path):
+        checkpoints, path = hostile
+        (tmp_path / "secret").write_text("secret")
+        forge(path, "../../secret", b"secret")
+        assert "../../secret lies outside of it" in self.refused(checkpoints, path)
+
+    def test_a_link_to_a_file_elsewhere(self, hostile, tmp_path):
+        checkpoints, path = hostile
+        file = path / "components" / "0000-policy" / "tensors.safetensors"
+        file.rename(tmp_path / "elsewhere")
+        file.symlink_to(tmp_path / "elsewhere")
+        assert "lies outside of it" in self.refused(checkpoints, path)
+
+    def test_a_file_without_a_checksum(self, hostile):
+        checkpoints, path = hostile
+        sums = json.loads((path / "checksums.json").read_text())
+        del sums["components/0000-policy/tensors.safetensors"]
+        (path / "checksums.json").write_text(json.dumps(sums))
+        assert "is not complete: checksums.json lacks files of components/0000-policy" in self.refused(
+            checkpoints, path
+        )
+
+    @pytest.mark.parametrize(
+        "structure",
+        [
+            [],
+            {},
+            3,
+            None,
+            {"call": "os.system"},
+            {"tensor": "missing"},
+            {"tensor": []},
+            {"dict": [["weight", {"tensor": "weight"}]]},
+            {"dict": [["weight", {"tensor": "weight"}], ["bias", {"tensor": "weight"}]]},
+            {"dict": [[[1], 2]]},
+            {"dict": 5},
+            {"size": ["a"]},
+            {"tensordict": {"a": {"tensor": "weight"}}, "batch_size": [17], "names": [None]},
+            {"tensordict": {}},
+            {"tuple": {"__reduce__": ["os.system", "true"]}},
+        ],
+        ids=str,
+    )
+    def test_a_structure_that_means_nothing(self, hostile, structure):
+        checkpoints, path = hostile
+        forge(path, "components/0000-policy/structure.json", structure)
+        self.refused(checkpoints, path)
+
+    def test_a_structure_that_is_too_deep(self, hostile):
+        checkpoints, path = hostile
+        forge(path, "components/0000-policy/structure.json", b'{"list":[' * 50_000 + b"]}" * 50_000)
+        self.refused(checkpoints, path)
+
+    def test_a_manifest_and_checksums_that_are_too_deep(self, hostile):
+        checkpoints, path = hostile
+        forge(path, "manifest.json", b"[" * 100_000 + b"]" * 100_000)
+        self.refused(checkpoints, path)
+        (path / "checksums.json").write_bytes(b"[" * 100_000 + b"]" * 100_000)
+        self.refused(checkpoints, path)
+
+
+class TestLoadPolicy:
+    def test_best_last_and_by_path(self, tmp_path):
+        checkpoints, policies = Checkpoints(tmp_path), [nn.Linear(1, 1) for _ in range(3)]
+        paths = [
+            checkpoints.save({"policy": policy}, step=step, score=score)
+            for step, (policy, score) in enumerate(zip(policies, (0.1, 0.9, None), strict=True))
+        ]
+        save_weights(policies[0], tmp_path / "weights.safetensors")
+        expected = {"best": 1, "last": 2, str(paths[1]): 1, str(tmp_path / "weights.safetensors"): 0}
+        for which, number in expected.items():
+            copy = nn.Linear(1, 1)
+            load_policy(copy, tmp_path, which)
+            assert (copy.weight == policies[number].weight).all(), which
+
+    @pytest.mark.parametrize(
+        ("which", "message"),
+        [
+            ("best", "checkpoint=best is not in .*: the run has not saved anything yet"),
+            ("last", "checkpoint=last is not in .*: the run has not saved anything yet"),
+            ("nowhere", "checkpoint can't be loaded: nowhere is not a checkpoint of this package"),
+        ],
+    )
+    def test_there_is_none(self, tmp_path, which, message):
+        with pytest.raises(ValueError, match=message):
+            load_policy(nn.Linear(1, 1), tmp_path / "checkpoints", which)
+
+    def test_it_does_not_fit(self, tmp_path):
+        Checkpoints(tmp_path).save({"policy": nn.Linear(2, 2)}, step=1)
+        with pytest.raises(ValueError, match=r"checkpoint can't be loaded: .* does not fit; "):
+            load_policy(nn.Linear(3, 2), tmp_path)

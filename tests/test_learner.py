@@ -1,9 +1,11 @@
+from copy import deepcopy
+
 import pytest
 import torch
 from helpers import build, collect, parameter_distance, small_env, tiny_settings
 from tensordict import TensorDict
 
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.learner import Learner, LearnerSettings, NonFiniteError
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
 
 
@@ -211,7 +213,7 @@ class TestSettings:
         [
             ("burn_in", 1.0, r"burn_in must lie in \[0, 1\), got 1.0; "),
             ("loss_function", "l1", "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
-            ("sampling", "rows", "sampling must be 'steps' or 'episodes', got 'rows'; "),
+            ("sampling", "rows", "sampling must be 'steps', 'episodes' or 'episode_starts', got 'rows'; "),
         ],
     )
     def test_wrong_values_that_concern_its_parts(self, name, value, message):
@@ -252,3 +254,92 @@ class TestSettings:
     def test_settings_are_frozen(self):
         with pytest.raises(AttributeError):
             LearnerSettings().slice_len = 3
+
+
+class Keep:
+    """Stores batches as they are, from the second on, and counts them."""
+
+    def __init__(self):
+        self.batches = 0
+
+    def __call__(self, batch):
+        self.batches += 1
+        return batch if self.batches > 1 else None
+
+    def state_dict(self):
+        return {"batches": self.batches}
+
+    def load_state_dict(self, state):
+        self.batches = state["batches"]
+
+
+class TestState:
+    def test_a_copy_goes_on_alike(self):
+        """In the middle of the minibatches of one draw, after a first transition that came late."""
+        settings = {
+            "learning_rate": 0.05,
+            "learning_rate_end": 1e-3,
+            "learning_rate_frames": 200,
+            "frames_per_update": 4,
+        }
+        first, second = (make_learner(extract=Keep(), capacity=24, **settings) for _ in range(2))
+        torch.manual_seed(1)
+        batches = [make_batch() for _ in range(6)]
+        for batch in batches[:3]:
+            first.store(batch)
+        for _ in range(3):
+            first.update(first.sample())
+        torch.manual_seed(7)
+        second.update(make_batch())  # it has other weights and another optimiser
+        second.load_state_dict(deepcopy(first.state_dict()))  # torch's optimiser keeps what it is given
+        assert second.updates_due() == first.updates_due() == 5
+        losses = []
+        for learner in (first, second):
+            torch.manual_seed(2)
+            losses.append([])
+            for batch in batches[3:]:
+                for _ in range(learner.updates_due()):
+                    losses[-1].append(learner.update(learner.sample())["loss"].item())
+                learner.store(batch)
+        assert losses[0] == losses[1] and len(losses[0]) == 13
+        for params in ("value_network_params", "target_value_network_params"):
+            assert parameter_distance(*(getattr(learner.loss, params).data for learner in (first, second))) == 0
+        assert first.optimizer.param_groups[0]["lr"] == second.optimizer.param_groups[0]["lr"] == second.learning_rate
+
+
+class TestNumbersThatAreNone:
+    def poisoned(self, **settings):
+        learner = make_learner(**settings)
+        learner.store(make_batch())
+        learner.update(learner.sample())
+        return learner, learner.sample()
+
+    def check_nothing_was_learned(self, learner, sample, message):
+        everything = [*learner.loss.parameters(), *learner.loss.buffers()]
+        before = [value.clone() for value in everything]
+        moments = [state["exp_avg"].clone() for state in learner.optimizer.state.values()]
+        with pytest.raises(NonFiniteError, match=message):
+            learner.update(sample)
+        assert all((new == old).all() for new, old in zip(everything, before, strict=True))
+        assert all((s["exp_avg"] == m).all() for s, m in zip(learner.optimizer.state.values(), moments, strict=True))
+        assert learner.updates == 1
+
+    @pytest.mark.parametrize(("value", "shown"), [(float("nan"), "nan"), (float("inf"), "(inf|nan)")])
+    @pytest.mark.parametrize("max_grad_norm", [None, 1.0])
+    def test_a_loss(self, value, shown, max_grad_norm):
+        learner, sample = self.poisoned(max_grad_norm=max_grad_norm)
+        sample["next", "reward"].fill_(value)
+        self.check_nothing_was_learned(learner, sample, f"^the loss became {shown} in update 2, frame 16$")
+
+    def test_a_gradient(self):
+        learner, sample = self.poisoned()
+        name, parameter = list(learner.network.named_parameters())[-1]
+        parameter.register_hook(lambda gradient: gradient * float("nan"))
+        message = f"^the gradient of {name} became NaN or infinite in update 2, frame 16$"
+        self.check_nothing_was_learned(learner, sample, message.replace(".", r"\."))
+
+    def test_a_norm_of_gradients_that_are_numbers(self):
+        learner, sample = self.poisoned(max_grad_norm=1.0)
+        for parameter in learner.network.parameters():
+            parameter.register_hook(lambda gradient: torch.full_like(gradient, 3e38))
+        self.check_nothing_was_learned(learner, sample, "^the gradient's norm became infinite in update 2, frame 16$")

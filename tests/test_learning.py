@@ -4,8 +4,9 @@ import pytest
 import torch
 from helpers import build, make_collector, small_env, tiny_settings
 
+from hdrqn_torchrl.algorithms import make_v3
 from hdrqn_torchrl.evaluation import evaluate
-from hdrqn_torchrl.modules import EpsilonGreedy, compact_network
+from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
 
 TASK = {"num_obstacles": 0, "max_steps": 16, "view": 3}
 
@@ -24,6 +25,11 @@ def learned(name, total_frames, **options):
         tau=0.01,
     )
     algorithm = build(name, env, compact_network(32, (64,)), settings=settings, gamma=0.9, **options)
+    return train(algorithm, env, total_frames)
+
+
+def train(algorithm, env, total_frames):
+    """Success of the greedy policy after training, and before it."""
     evaluation_env = algorithm.transform(small_env(200, **TASK))
     before = evaluate(evaluation_env, algorithm.policy, episodes=200)["success_rate"]
     collector = make_collector(algorithm, env, 8, total_frames)
@@ -54,3 +60,32 @@ def test_drqn_learns_what_takes_memory():
     """The window shows a part of the room: who forgets what was behind finds the second goal by luck."""
     (with_memory, before), (without, _) = (learned(name, 45_000, exploration=schedule()) for name in ("drqn", "dqn"))
     assert before < 0.5 and with_memory >= 0.8 > 0.7 >= without
+
+
+@pytest.mark.slow
+def test_v3_solves_a_small_room():
+    """In two thirds of v2's frames; with view 3 it has to remember what it passed."""
+    torch.manual_seed(0)
+    env = small_env(32, **TASK)
+    learner = tiny_settings(
+        slice_len=16,
+        batch_size=16,
+        capacity=50_000,
+        warmup_frames=2_000,
+        learning_rate=3e-3,
+        tau=0.02,
+        max_grad_norm=10.0,
+        sampling="episode_starts",
+    )
+    algorithm = make_v3(
+        env,
+        compact_network(32, (64,)),
+        learner=learner,
+        memory_size=32,
+        head_size=32,
+        sub_gamma=0.9,
+        sub_exploration=RepeatingEpsilonGreedy(1.0, 0.1, anneal_frames=10_000, max_repeats=4),
+        meta_exploration=EpsilonGreedy(1.0, 0.1, anneal_frames=10_000),
+    )
+    after, before = train(algorithm, env, 16_384)
+    assert before < 0.5 and after >= 0.95

@@ -1,9 +1,20 @@
 import csv
 import io
+import os
+import sys
+from types import ModuleType, SimpleNamespace
 
+import pytest
 from rich.console import Console
 
-from hdrqn_torchrl.logging import CSVLog, RunLogger, make_tensorboard_logger, progress_line
+from hdrqn_torchrl.logging import (
+    CSVLog,
+    RunLogger,
+    make_mlflow_logger,
+    make_tensorboard_logger,
+    make_wandb_logger,
+    progress_line,
+)
 
 ROW = {"frames": 1_000, "frames_per_second": 2_000.0, "sub/updates_per_second": 30.0, "sub/epsilon": 0.5}
 GREEDY = {"greedy/return": 1.25, "greedy/success": 0.5, "greedy/ceiling": 2.0}
@@ -43,13 +54,92 @@ class TestCSVLog:
             {"frames": "2", "loss": "", "epsilon": "1.0"},
         ]
 
+    @pytest.mark.parametrize("half", ["3,0.2", "3", '3,"0.2'])
+    def test_half_a_row_of_a_killed_process_is_dropped(self, tmp_path, half):
+        path = tmp_path / "metrics.csv"
+        path.write_text(f"frames,loss\n1,0.5\n2,0.25\n{half}")
+        log = CSVLog(path)
+        assert log.rows == 2
+        log.write({"frames": 3, "loss": 0.125})
+        assert path.read_text() == "frames,loss\n1,0.5\n2,0.25\n3,0.125\n"
+
+    def test_a_header_without_rows_is_kept(self, tmp_path):
+        path = tmp_path / "metrics.csv"
+        path.write_text("frames,loss")
+        CSVLog(path).write({"frames": 1, "loss": 0.5})
+        assert read(path) == [{"frames": "1", "loss": "0.5"}]
+
+    def test_each_row_is_on_the_disk_when_it_is_written(self, tmp_path, monkeypatch):
+        synced = []
+        monkeypatch.setattr(
+            "hdrqn_torchrl.logging.os.fsync", lambda _: synced.append((tmp_path / "metrics.csv").exists())
+        )
+        log = CSVLog(tmp_path / "metrics.csv")
+        log.write({"frames": 1})
+        log.write({"frames": 2})
+        assert synced == [False, True, True]  # the header before it has its name, then two rows
+
+
+class TestPosition:
+    """Where a run that is resumed goes on in its table."""
+
+    def log(self, path):
+        log = CSVLog(path)
+        log.write({"frames": 1})
+        log.write({"frames": 2, "loss": 0.5})
+        return log
+
+    @pytest.mark.parametrize("later", ["", "3,0.25\n", "3,0.25\n4,0.1", "3,0.25\n4,0.1\n5,0.0\n"])
+    def test_rows_after_it_are_dropped(self, tmp_path, later):
+        path = tmp_path / "metrics.csv"
+        state = self.log(path).state_dict()
+        with path.open("a") as file:
+            file.write(later)
+        log = CSVLog(path)
+        log.load_state_dict(state)
+        assert log.state_dict() == state == {"columns": ["frames", "loss"], "rows": 2}
+        log.write({"frames": 3, "loss": 0.125})
+        assert path.read_text() == "frames,loss\n1,\n2,0.5\n3,0.125\n"
+        assert [each.name for each in tmp_path.iterdir()] == ["metrics.csv"]
+
+    def test_so_are_columns_that_came_after_it(self, tmp_path):
+        path = tmp_path / "metrics.csv"
+        log = self.log(path)
+        state = log.state_dict()
+        log.write({"frames": 3, "loss": 0.25, "late": 1.0})
+        log = CSVLog(path)
+        log.load_state_dict(state)
+        log.write({"frames": 3, "loss": 0.25})
+        assert path.read_text() == "frames,loss\n1,\n2,0.5\n3,0.25\n"
+
+    def test_a_table_that_was_removed_begins_anew(self, tmp_path):
+        path = tmp_path / "metrics.csv"
+        state = self.log(path).state_dict()
+        path.unlink()
+        log = CSVLog(path)
+        log.load_state_dict(state)
+        log.write({"frames": 3, "loss": 0.25})
+        assert read(path) == [{"frames": "3", "loss": "0.25"}] and log.rows == 1
+
+    def test_one_before_the_first_row(self, tmp_path):
+        path = tmp_path / "metrics.csv"
+        state = CSVLog(path).state_dict()
+        self.log(path)
+        log = CSVLog(path)
+        log.load_state_dict(state)
+        log.write({"frames": 1})
+        assert read(path) == [{"frames": "1"}]
+
 
 class FakeLogger:
     def __init__(self):
-        self.scalars = []
+        self.rows, self.closed = [], False
 
-    def log_scalar(self, name, value, step):
-        self.scalars.append((name, value, step))
+    def log_metrics(self, row, step):
+        self.rows.append((row, step))
+
+    def close(self):
+        self.closed = True
 
 
 def run_logger(folder, *, terminal=False, **settings):
@@ -65,7 +155,7 @@ class TestRunLogger:
         logger.close()
         assert read(tmp_path / "metrics.csv")[0]["sub/epsilon"] == "0.5"
         for fake in loggers:
-            assert fake.scalars == [(name, value, 1_000) for name, value in ROW.items()]
+            assert fake.rows == [(ROW, 1_000)] and fake.closed
 
     def test_without_a_terminal_each_greedy_evaluation_prints_one_line(self, tmp_path):
         logger, console = run_logger(tmp_path)
@@ -87,6 +177,18 @@ class TestRunLogger:
         assert "1,000/10,000 frames" in shown and "greedy +1.25 of 2.00" in shown
         assert "    1,000 frames  " not in shown
 
+    def test_its_position_is_that_of_the_table_and_the_last_greedy_result(self, tmp_path):
+        logger, _ = run_logger(tmp_path)
+        logger.log(ROW | GREEDY)
+        state = logger.state_dict()
+        logger.log(ROW | GREEDY | {"greedy/return": 0.0})
+        other, console = run_logger(tmp_path, terminal=True)
+        other.load_state_dict(state)
+        assert other.state_dict() == state and state["csv"]["rows"] == 1
+        other.log(ROW)
+        other.close()
+        assert "greedy +1.25 of 2.00" in console.file.getvalue() and len(read(tmp_path / "metrics.csv")) == 2
+
     def test_no_ceiling_no_mention_of_it(self, tmp_path):
         logger, console = run_logger(tmp_path)
         logger.log(ROW | {"greedy/return": -0.5, "greedy/success": 0.0})
@@ -104,3 +206,143 @@ def test_tensorboard_files_lie_in_the_run_folder(tmp_path):
     logger = make_tensorboard_logger(tmp_path)
     logger.log_scalar("loss", 0.5, step=3)
     assert list((tmp_path / "tensorboard").glob("events*"))
+
+
+SETTINGS = {"seed": 3, "algo": {"gamma": 0.9, "sub": {"tau": 0.5}}}
+
+
+@pytest.mark.parametrize(
+    ("package", "make"),
+    [("wandb", make_wandb_logger), ("mlflow", lambda folder: make_mlflow_logger(folder, tracking_uri="sqlite:///x"))],
+)
+def test_a_missing_package_is_named_with_its_extra(package, make, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, package, None)  # as if it were not installed
+    with pytest.raises(ImportError, match=rf"needs the package {package} .*pip install 'hdrqn_torchrl\[{package}\]'"):
+        make(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+class FakeService:
+    """Stands in for TorchRL's logger of a service whose package need not be installed."""
+
+    made: list
+
+    def __init__(self, *args, **settings):
+        number = len(self.made)
+        self.args, self.settings, self.params = args, settings, None
+        self.environment = os.environ.get("MLFLOW_RUN_ID")
+        self.experiment = SimpleNamespace(info=SimpleNamespace(run_id=f"run{number}"))
+        self.made.append(self)
+
+    def log_hparams(self, params):
+        self.params = params
+
+
+@pytest.fixture
+def wandb_runs(monkeypatch):
+    made = []
+    monkeypatch.setitem(sys.modules, "wandb", ModuleType("wandb"))
+    monkeypatch.setattr(
+        "torchrl.record.loggers.wandb.WandbLogger", type("FakeWandb", (FakeService,), {"made": made}), raising=True
+    )
+    return made
+
+
+class TestWandb:
+    def test_it_lies_in_the_run_folder_and_is_named_after_it(self, wandb_runs, tmp_path):
+        folder = tmp_path / "gridworld-v2" / "seed3"
+        folder.mkdir(parents=True)
+        make_wandb_logger(folder, project="mine", settings=SETTINGS)
+        (run,) = wandb_runs
+        assert run.args == ("gridworld-v2/seed3",) and run.params == SETTINGS
+        assert (run.settings["project"], run.settings["save_dir"]) == ("mine", str(folder))
+
+    def test_a_resumed_run_goes_on_and_another_does_not(self, wandb_runs, tmp_path):
+        for folder in (tmp_path / "a", tmp_path / "b"):
+            folder.mkdir()
+            make_wandb_logger(folder)
+        make_wandb_logger(tmp_path / "a")
+        first, other, resumed = (run.settings["id"] for run in wandb_runs)
+        assert first == resumed != other
+
+    @pytest.mark.parametrize(("offline", "mode"), [(True, "offline"), (False, None)])
+    def test_offline(self, wandb_runs, tmp_path, offline, mode):
+        make_wandb_logger(tmp_path, offline=offline)
+        assert wandb_runs[0].settings["mode"] == mode
+
+    def test_the_real_one(self, tmp_path):
+        pytest.importorskip("wandb")
+        for folder in (tmp_path / "a", tmp_path / "b", tmp_path / "a"):
+            folder.mkdir(exist_ok=True)
+            logger = make_wandb_logger(folder, offline=True, settings=SETTINGS)
+            logger.log_scalar("loss", 0.5, step=3)
+            assert logger.experiment.config["algo"] == SETTINGS["algo"]
+            assert logger.experiment.id in (folder / "wandb.json").read_text()
+        logger.close()
+        assert "WANDB_MODE" not in os.environ  # it would hold for the next run in this process
+        assert [len(list((tmp_path / name).glob("wandb/offline-run-*"))) for name in "ab"] == [2, 1]
+
+
+@pytest.fixture
+def mlflow_runs(monkeypatch):
+    made = []
+    package = ModuleType("mlflow")
+    for name in ("end_run", "set_tracking_uri", "set_experiment", "set_tag"):
+        setattr(package, name, lambda *_, name=name: made.append((name, *_)))
+    package.exceptions = SimpleNamespace(MlflowException=RuntimeError)
+    monkeypatch.setitem(sys.modules, "mlflow", package)
+    monkeypatch.setattr(
+        "torchrl.record.loggers.mlflow.MLFlowLogger", type("FakeMLflow", (FakeService,), {"made": made}), raising=True
+    )
+    return made
+
+
+class TestMLflow:
+    def uri(self, tmp_path):
+        return f"sqlite:///{tmp_path}/deep/mlflow.db"
+
+    def make(self, runs, folder, uri, **settings):
+        """The fake logger of one run, and what was asked of MLflow before and after it."""
+        runs.clear()
+        folder.mkdir(exist_ok=True)
+        make_mlflow_logger(folder, tracking_uri=uri, **settings)
+        (logger,) = (each for each in runs if isinstance(each, FakeService))
+        return logger, [each for each in runs if each is not logger]
+
+    def test_a_new_run(self, mlflow_runs, tmp_path):
+        uri = self.uri(tmp_path)
+        logger, asked = self.make(mlflow_runs, tmp_path / "seed3", uri, experiment="mine", settings=SETTINGS)
+        assert asked == [
+            ("end_run",),  # an earlier job's, in the same process
+            ("set_tracking_uri", uri),
+            ("set_experiment", "mine"),
+            ("set_tag", "mlflow.runName", f"{tmp_path.name}/seed3"),
+        ]
+        assert logger.args == ("mine", uri) and logger.environment is None
+        assert logger.params == {"seed": 3, "algo.gamma": 0.9, "algo.sub.tau": 0.5}
+        assert (tmp_path / "deep").is_dir()
+
+    def test_a_resumed_run_goes_on_and_another_does_not(self, mlflow_runs, tmp_path):
+        first, _ = self.make(mlflow_runs, tmp_path / "a", self.uri(tmp_path), settings=SETTINGS)
+        other, _ = self.make(mlflow_runs, tmp_path / "b", self.uri(tmp_path))
+        resumed, asked = self.make(mlflow_runs, tmp_path / "a", self.uri(tmp_path), settings=SETTINGS)
+        assert resumed.environment == first.experiment.info.run_id and other.environment is None
+        assert resumed.params is None and ("set_tag",) not in {each[:1] for each in asked}  # they can't be changed
+        assert "MLFLOW_RUN_ID" not in os.environ
+
+    def test_the_real_one(self, tmp_path):
+        mlflow = pytest.importorskip("mlflow")
+        for step, folder in enumerate((tmp_path / "a", tmp_path / "b", tmp_path / "a")):
+            folder.mkdir(exist_ok=True)
+            logger = make_mlflow_logger(folder, tracking_uri=self.uri(tmp_path), settings=SETTINGS)
+            logger.log_scalar("loss", 0.5, step=step)
+        mlflow.end_run()
+        runs = mlflow.search_runs(experiment_names=["hdrqn_torchrl"], output_format="list")
+        steps = {
+            run.info.run_name: [each.step for each in mlflow.MlflowClient().get_metric_history(run.info.run_id, "loss")]
+            for run in runs
+        }
+        assert steps == {f"{tmp_path.name}/a": [0, 2], f"{tmp_path.name}/b": [1]}
+        assert runs[0].data.params == {"seed": "3", "algo.gamma": "0.9", "algo.sub.tau": "0.5"}
+        with pytest.raises(ValueError, match=r"tracking_uri must be where .*; remove .*mlflow\.json"):
+            make_mlflow_logger(tmp_path / "a", tracking_uri=f"sqlite:///{tmp_path}/other.db")

@@ -1,9 +1,13 @@
 import json
+import os
+import signal
+import time
 from types import SimpleNamespace
 
 import pytest
+from processes import start
 
-from hdrqn_torchrl.run_folder import ceiling_of, write_results
+from hdrqn_torchrl.run_folder import ceiling_of, locked, write_results, write_whole
 
 REFERENCES = {"planner": {"return_mean": 2.0}, "memory": {"return_mean": 1.9, "steps_mean": 16.5}}
 RESULT = {"return_mean": 0.5, "success_rate": 0.25, "in_order_rate": 0.4, "steps_mean": 40.0, "episodes": 100}
@@ -34,3 +38,62 @@ def test_a_task_without_scripted_players_has_no_ceiling(folder):
 def test_the_ceiling_is_that_of_the_player_with_the_agents_view():
     assert ceiling_of(REFERENCES) == 1.9
     assert ceiling_of({"planner": {"return_mean": 2.0}}) is None
+
+
+class TestWriteWhole:
+    def test_it_replaces_a_file_and_leaves_nothing_else(self, tmp_path):
+        for text in ("first and long", "second"):
+            write_whole(tmp_path / "run.json", text)
+            assert (tmp_path / "run.json").read_text() == text
+        assert len(list(tmp_path.iterdir())) == 1
+
+    def test_a_failed_write_keeps_the_file_before(self, tmp_path, monkeypatch):
+        write_whole(tmp_path / "run.json", "before")
+        monkeypatch.setattr(os, "fsync", lambda _: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            write_whole(tmp_path / "run.json", "after")
+        assert (tmp_path / "run.json").read_text() == "before"
+
+
+def hold(folder):
+    with locked(folder):
+        (folder / "held").write_text("")
+        time.sleep(60)
+
+
+class TestLocked:
+    def test_another_process_is_kept_out_until_it_ends_however_it_ends(self, tmp_path):
+        process = start(hold, tmp_path / "run")
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "run" / "held").exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        with (
+            pytest.raises(ValueError, match=r"run is in use: another process is training there; wait or stop it\."),
+            locked(tmp_path / "run"),
+        ):
+            raise AssertionError("both are in")
+        os.kill(process.pid, signal.SIGKILL)
+        process.join(30)
+        with locked(tmp_path / "run"):
+            pass
+
+    def test_one_after_the_other_in_a_process(self, tmp_path):
+        for _ in range(2):
+            with pytest.raises(ZeroDivisionError), locked(tmp_path):
+                _ = 1 / 0
+        with (
+            locked(tmp_path),
+            pytest.raises(ValueError, match="is in use"),
+            locked(tmp_path),
+        ):
+            raise AssertionError("both are in")
+
+    def test_a_folder_that_can_not_be_written(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with (
+            pytest.raises(
+                ValueError, match=r"the run folder must be writable, got .*file/run \(.*\); choose another one"
+            ),
+            locked(tmp_path / "file" / "run"),
+        ):
+            raise AssertionError("it is in")

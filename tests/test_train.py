@@ -5,20 +5,27 @@ import json
 import math
 import os
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
-from helpers import make_collector
+from helpers import check_same_checkpoint, make_collector, table
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
+from processes import leftovers, limit_file_size, limited_file_size, run_script, start_script
 
 import train
+from hdrqn_torchrl.checkpoint import verify
+from hdrqn_torchrl.learner import Learner
+from hdrqn_torchrl.logging import CSVLog
+from hdrqn_torchrl.run_folder import locked
 
 ROOT = Path(train.__file__).parent
 CONF = ROOT / "conf"
@@ -73,7 +80,7 @@ class TestTree:
         config = configure(f"experiment={experiment}", "total_frames=77", "algo.gamma=0.5")
         assert (config.total_frames, config.algo.gamma) == (77, 0.5)
 
-    @pytest.mark.parametrize("logger", choices("logger"))
+    @pytest.mark.parametrize("logger", ["csv", "tensorboard"])  # the others are extras: tests/test_logging.py
     def test_every_logger_builds(self, logger, tmp_path):
         loggers = [instantiate(each, tmp_path) for each in configure(f"logger={logger}").logger.loggers]
         assert all(hasattr(each, "log_scalar") for each in loggers)
@@ -154,16 +161,6 @@ class TestMessages:
     def test_an_unknown_name_is_named(self, run, argument, part):
         assert part in run(argument)
 
-    def test_a_gpu_that_is_not_there(self):
-        with pytest.raises(ValueError, match="device must be cpu or auto"):
-            train.pick_device("cuda", has_cuda=False)
-
-    @pytest.mark.parametrize(
-        ("name", "has_cuda", "device"), [("auto", True, "cuda"), ("auto", False, "cpu"), ("cpu", True, "cpu")]
-    )
-    def test_pick_device(self, name, has_cuda, device):
-        assert train.pick_device(name, has_cuda) == device
-
 
 def call(folder, *arguments):
     """Runs train.py in ``folder`` as a process of its own."""
@@ -184,7 +181,8 @@ def test_questions_are_answered_without_loading_torch(tmp_path, question):
 
 def check_run_folder(folder, *, frames):
     names = {path.name for path in folder.iterdir()}
-    assert {"config.yaml", "metrics.csv", "summary.json", "curves.png", "checkpoints"} <= names
+    assert {"config.yaml", "run.json", "metrics.csv", "summary.json", "curves.png", "checkpoints"} <= names
+    assert not {name for name in names if name.endswith((".partial", ".txt"))}
     summary = json.loads((folder / "summary.json").read_text())
     assert set(SUMMARY) <= set(summary)
     assert all(isinstance(summary[key], (int, float)) and math.isfinite(summary[key]) for key in SUMMARY)
@@ -193,7 +191,8 @@ def check_run_folder(folder, *, frames):
         rows = list(csv.DictReader(file))
     assert (int(rows[0]["frames"]), int(rows[-1]["frames"])) == (0, frames)
     assert rows[-1]["greedy/return"] and rows[-1]["behaviour/return"]
-    assert {path.name for path in (folder / "checkpoints").iterdir()} == {"last.safetensors", "best.safetensors"}
+    checkpoints = sorted(path.name for path in (folder / "checkpoints").iterdir())
+    assert checkpoints[-1] == f"checkpoint-{frames:012d}" and len(checkpoints) <= 3
     return summary
 
 
@@ -222,29 +221,264 @@ def test_a_sweep_runs_one_job_after_the_other(tmp_path):
         assert OmegaConf.load(folder / "config.yaml").algo.recurrent == recurrent
 
 
-@pytest.mark.slow
-def test_ctrl_c_keeps_what_there_is(tmp_path):
-    endless = [setting for setting in TINY if "total_frames" not in setting]
-    command = [
-        sys.executable,
-        str(ROOT / "train.py"),
-        *endless,
-        *TINY_HDRQN,
-        "hydra.run.dir=run",
-        "total_frames=100000000",
-    ]
-    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
-    try:
-        metrics = tmp_path / "run" / "metrics.csv"
-        for _ in range(1_200):
-            if metrics.exists() and len(metrics.read_text().splitlines()) > 3:
-                break
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.1)
-        process.send_signal(signal.SIGINT)
-        _, told = process.communicate(timeout=120)
-    finally:
-        process.kill()
-    assert process.returncode not in (0, None) and "interrupted" in told
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["frames"] > 0 and (tmp_path / "run" / "checkpoints" / "last.safetensors").exists()
+SHORT = [
+    "device=cpu", "env.num_envs=16", "total_frames=2048", "log_frames=256", "evaluation.num_envs=8",
+    "evaluation.episodes=8", "evaluation.interval_frames=100_000", "evaluation.final_episodes=8",
+    "network.hidden_size=8", "network.widths=[8]", "logger=csv", "checkpoint.interval_frames=512", *TINY_HDRQN,
+]  # fmt: skip
+
+
+def wait_for_row(folder, frames, process):
+    """Until the only run below ``folder`` has a log point at or after ``frames``; returns its folder."""
+    deadline = time.monotonic() + 100
+    while time.monotonic() < deadline and process.is_alive():
+        for metrics in folder.rglob("metrics.csv"):
+            if any(int(row["frames"]) >= frames for row in table(metrics.parent)):
+                return metrics.parent
+        time.sleep(0.01)
+    raise AssertionError((folder / "stderr.txt").read_text())
+
+
+def stop(process, number):
+    os.kill(process.pid, number)
+    process.join(60)
+    return process.exitcode
+
+
+class TestStoppingAndResuming:
+    def test_a_run_that_was_stopped_twice_is_the_same_as_one_that_was_not(self, tmp_path):
+        """By SIGTERM and by Ctrl-C; gone on with by ``resume=FOLDER`` and by the same command with ``resume=auto``."""
+        plain, same = tmp_path / "plain", tmp_path / "same"
+        for folder in (plain, same):
+            folder.mkdir()
+        code, _, told = run_script(plain, *SHORT, "hydra.run.dir=run")
+        assert code == 0, told
+
+        process = start_script(same, *SHORT, "resume=auto")
+        run = wait_for_row(same, 512, process)
+        assert stop(process, signal.SIGTERM) == 143
+        told = (same / "stderr.txt").read_text()
+        assert f"stopped by SIGTERM; `python train.py resume={run}` goes on" in told and "Traceback" not in told
+        self.check_stopped(run, before=2048)
+
+        process = start_script(same, f"resume={run.relative_to(same)}")
+        wait_for_row(same, 1280, process)
+        assert stop(process, signal.SIGINT) == 130
+        assert "stopped by SIGINT; " in (same / "stderr.txt").read_text()
+        self.check_stopped(run, before=2048)
+
+        code, printed, told = run_script(same, *SHORT, "resume=auto")
+        assert code == 0, told
+        assert json.loads(printed)["run"] == str(run.relative_to(same)) and len(list(same.rglob("config.yaml"))) == 1
+        check_same_checkpoint(run, plain / "run")
+        assert table(run) == table(plain / "run") and len(table(run)) == 9
+        check_run_folder(run, frames=2_048)
+        summaries = [json.loads((folder / "summary.json").read_text()) for folder in (run, plain / "run")]
+        assert summaries[0] | {"wall_seconds": 0} == summaries[1] | {"wall_seconds": 0}
+
+    def check_stopped(self, run, *, before):
+        assert {"config.yaml", "run.json", "metrics.csv", "checkpoints"} <= {path.name for path in run.iterdir()}
+        assert not (run / "summary.json").exists() and not (run / "error.txt").exists()
+        assert 0 < max(int(path.name[-12:]) for path in (run / "checkpoints").iterdir()) < before
+        assert not list((run / "checkpoints").glob(".*"))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The folder above a short finished run, ``run``, with checkpoints at 512 and 1024 frames."""
+    folder = tmp_path_factory.mktemp("finished")
+    code, _, told = run_script(folder, *SHORT, "total_frames=1024", "hydra.run.dir=run")
+    assert code == 0, told
+    return folder
+
+
+@pytest.fixture
+def a_run(finished, tmp_path):
+    """A copy of it to work on."""
+    return shutil.copytree(finished, tmp_path / "a") / "run"
+
+
+def snapshot(folder):
+    """All files with their contents, but for the lock."""
+    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file() and path.name != ".lock"}
+
+
+class TestGoingOnWithAFinishedRun:
+    def test_for_more_frames(self, a_run):
+        process = start_script(a_run.parent, "resume=run", "total_frames=4096")
+        wait_for_row(a_run.parent, 1280, process)
+        assert not (a_run / "summary.json").exists() and not (a_run / "curves.png").exists()  # it is unfinished again
+        assert stop(process, signal.SIGTERM) == 143
+        assert OmegaConf.load(a_run / "config.yaml").total_frames == 4096
+
+    def test_when_nothing_is_left_to_do(self, a_run):
+        rows, before = table(a_run), snapshot(a_run / "checkpoints")
+        code, _, told = run_script(a_run.parent, "resume=run")
+        assert code == 0, told
+        assert table(a_run) == rows and snapshot(a_run / "checkpoints") == before
+        check_run_folder(a_run, frames=1_024)
+
+    def test_from_an_older_checkpoint(self, a_run, finished):
+        code, _, told = run_script(a_run.parent, "resume=run/checkpoints/checkpoint-000000000512")
+        assert code == 0, told
+        assert table(a_run) == table(finished / "run")
+        check_same_checkpoint(a_run, finished / "run")
+
+
+class TestWhatIsLeftAlone:
+    """Commands that must not touch a run, and say why."""
+
+    def refused(self, folder, *arguments):
+        code, printed, told = run_script(folder, *arguments)
+        assert code == 1 and "Traceback" not in told and printed == ""
+        return told.strip().splitlines()
+
+    def test_a_new_run_in_its_folder(self, a_run):
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, *SHORT, "hydra.run.dir=run")
+        assert told[-1].startswith("error: ") and "already holds a run, which would be overwritten" in told[-1]
+        assert snapshot(a_run) == before
+
+    def test_other_settings(self, a_run):
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run", "seed=5", "algo.sub.tau=0.5")
+        assert told[-4:-1] == [
+            "error: settings must be those of the run that is resumed, and differ from run:",
+            "  algo.sub.tau: 0.01 -> 0.5",
+            "  seed: 0 -> 5",
+        ]
+        assert snapshot(a_run) == before
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ("network.hidden_size=16", "checkpoint-000000001024 does not fit; it must be loaded with the settings"),
+            ("env.view=4", "env.view must be an odd number"),
+        ],
+    )
+    def test_other_settings_on_purpose_that_do_not_fit(self, a_run, change, message):
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run", change, "resume_override=true")
+        assert any(line.startswith("error: ") and message in line for line in told)
+        after = snapshot(a_run)
+        after.pop(a_run / "error.txt", None)
+        assert after == before
+
+    def test_one_that_is_being_trained(self, a_run):
+        before = snapshot(a_run)
+        with locked(a_run):
+            told = self.refused(a_run.parent, "resume=run")
+            assert "run is in use: another process is training there; wait or stop it." in told[-1]
+            empty = a_run.parent / "new"
+            with locked(empty):
+                told = self.refused(a_run.parent, *SHORT, "hydra.run.dir=new")
+            assert "new is in use" in told[-1] and [path.name for path in empty.iterdir()] == [".lock"]
+        assert snapshot(a_run) == before
+
+    def test_one_whose_checkpoints_are_all_damaged(self, a_run):
+        for manifest in a_run.rglob("manifest.json"):
+            manifest.write_text("{}")
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run")
+        assert any("checkpoint-000000000512 is damaged: manifest.json is not what was written" in line for line in told)
+        assert "error: no checkpoint in" in told[-1] and "can be loaded; remove that folder to start" in told[-1]
+        assert {path: content for path, content in snapshot(a_run).items() if path.name != "error.txt"} == before
+
+    def test_one_that_means_harm(self, a_run):
+        text = (a_run / "config.yaml").read_text()
+        (a_run / "config.yaml").write_text(text.replace("hdrqn_torchrl.modules.compact_network", "os.makedirs"))
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run")
+        assert "network._target_ must be one of the builders that this program trusts, got 'os.makedirs'" in told[-1]
+        assert snapshot(a_run) == before
+
+
+class TestFailures:
+    def test_a_wrong_setting_leaves_a_note_in_its_own_new_folder(self, tmp_path):
+        code, _, told = run_script(tmp_path, *SHORT, "hydra.run.dir=run", "env.view=4")
+        assert code == 1 and "error: env.view must be an odd number" in told and "Traceback" not in told
+        assert "view must be an odd number" in (tmp_path / "run" / "error.txt").read_text()
+        assert {path.name for path in (tmp_path / "run").iterdir()} == {".lock", "error.txt"}  # which is no run
+        process = start_script(tmp_path, *SHORT, "hydra.run.dir=run")
+        wait_for_row(tmp_path, 0, process)
+        assert not (tmp_path / "run" / "error.txt").exists()
+        assert stop(process, signal.SIGINT) == 130
+
+    def test_a_damaged_newest_checkpoint_costs_one_interval(self, a_run, finished):
+        newest = a_run / "checkpoints" / "checkpoint-000000001024"
+        (newest / "components" / "0004-policy" / "tensors.safetensors").write_bytes(b"half")
+        code, _, told = run_script(a_run.parent, "resume=run")
+        assert code == 0, told
+        assert "checkpoint-000000001024 is damaged: components/0004-policy/tensors.safetensors is not what" in told
+        check_same_checkpoint(a_run, finished / "run")
+        assert table(a_run) == table(finished / "run")
+
+    def test_a_kill_between_the_two_renames_of_a_replaced_checkpoint(self, a_run):
+        """Its only checkpoint has no name at that moment; it must not start from scratch."""
+        only = a_run / "checkpoints" / "checkpoint-000000001024"
+        for path in only.parent.iterdir():
+            if path != only:
+                shutil.rmtree(path)
+        rows, inode = table(a_run), only.stat().st_ino
+        only.rename(only.with_name(f".{only.name}.backup-0123"))
+        (only.parent / f".{only.name}.stage-0123").mkdir()
+        code, _, told = run_script(a_run.parent, "resume=run")
+        assert code == 0, told
+        assert list(only.parent.iterdir()) == [only] and table(a_run) == rows
+        assert only.stat().st_ino == inode  # it was not written again
+
+    def test_a_full_disk(self, a_run):
+        good = a_run / "checkpoints" / "checkpoint-000000001024"
+        command, limit = ["resume=run", "total_frames=2048"], partial(limit_file_size, 40_000)
+        code, printed, told = run_script(a_run.parent, *command, prepare=limit)
+        assert (code, printed) == (1, "") and "Traceback" not in told
+        line = told.strip().splitlines()[-1]
+        assert line.startswith("error: the checkpoint at step 1536 can't be written to ") and "File too large" in line
+        assert f"the last good checkpoint is {good.resolve()}. Make room" in line.replace("run/check", f"{a_run}/check")
+        assert "CheckpointError" in (a_run / "error.txt").read_text() and leftovers(a_run) == 0
+        verify(good)
+
+    def test_a_full_disk_when_a_row_of_metrics_is_written(self, a_run):
+        code, _, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=fill_disk_at_next_row)
+        assert code == 1 and "Traceback" not in told
+        line = told.strip().splitlines()[-1]
+        assert "File too large" in line and "then `python train.py resume=run` goes on from the last checkpoint" in line
+
+    def test_a_number_that_is_none(self, a_run):
+        code, printed, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=poison_updates)
+        assert (code, printed) == (1, "") and "Traceback" not in told
+        line = told.strip().splitlines()[-1]
+        assert (
+            line.startswith("error: sub: the loss became nan in update ") and "training stopped before it could" in line
+        )
+        assert "the last good checkpoint is " in line and "checkpoint-000000001024" in line
+        assert "NonFiniteError" in (a_run / "error.txt").read_text()
+
+    def test_a_folder_that_can_not_be_made(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        code, _, told = run_script(tmp_path, *SHORT, "hydra.run.dir=file/run")
+        assert code == 1 and "Not a directory" in told and "file/run" in told
+
+
+def fill_disk_at_next_row():
+    """The first row of metrics that a process writes does not fit on the disk."""
+    write = CSVLog.write
+
+    def write_on_a_full_disk(self, row):
+        with limited_file_size(self.path.stat().st_size + 10):
+            write(self, row)
+
+    CSVLog.write = write_on_a_full_disk
+
+
+def poison_updates():
+    """From 1280 frames on the loss of a process is NaN."""
+    sample = Learner.sample
+
+    def poisoned_sample(self):
+        drawn = sample(self)
+        if self.frames >= 1280:
+            self._parameters[0].data[0] = float("nan")
+        return drawn
+
+    Learner.sample = poisoned_sample

@@ -84,12 +84,15 @@ class EpisodeStartSampler(SliceSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
         length, count = self._adjusted_batch_size(batch_size)
-        if "starts" not in self._cache:
-            self._cache["starts"] = self._find_starts(storage, length)
-        time, environment = self._cache["starts"]
+        contents = storage._mutation_revision
+        if contents not in self._cache:
+            self._cache.clear()
+            self._cache[contents] = self._find_starts(storage, length)
+        time, environment = self._cache[contents]
         if not len(time):
             raise RuntimeError(
-                f"no episode is followed by slice_len={length} stored steps yet; update later or use shorter slices."
+                f"no stored start of an episode begins slice_len={length} stored steps; update later, raise capacity "
+                "or use shorter slices."
             )
         chosen = torch.randint(len(time), (count,), device=time.device, generator=self._rng)
         times = time[chosen].unsqueeze(-1) + torch.arange(length, device=time.device)
@@ -117,6 +120,7 @@ class SequenceStorage(LazyTensorStorage):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         stored = state_dict["stored"]
+        self._bump_mutation_revision()  # what samplers remember of the old contents is void
         self.initialized = stored is not None
         if stored is None:
             self._storage, self._len = None, 0

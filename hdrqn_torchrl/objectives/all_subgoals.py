@@ -7,12 +7,12 @@ Sub level, for each subgoal g, whichever was pursued:
 
 where :math:`e^g_t` is the end of the episode or of the subgoal, and :math:`\lambda_t` is lambda where the next action
 is greedy for g, else 0 (Watkins' cut). Meta level, by intra-option learning (Sutton, Precup and Singh, 1998): a step
-belongs to every option that would have taken its action,
+belongs to every option that would have taken its action, and to the one pursued,
 
 .. math:: y_t(g) = r^{ex}_t + \gamma_M U_{t+1}(g)
 
-with :math:`U(g) = \max_{g'} Q^M(s', g')` where g was attained, else :math:`Q^M(s', g)`. So the meta level, too, learns
-from every step and not only from those at which options begin.
+with :math:`U(g) = \max_{g'} Q^M(s', g')` where g was attained, else :math:`(1 - \lambda_t) Q^M(s', g) + \lambda_t
+y_{t+1}(g)`. So the meta level, too, learns from every step and not only from those at which options begin.
 """
 
 from __future__ import annotations
@@ -44,11 +44,12 @@ class AllSubgoalsLoss(LossModule):
         meta_gamma: discount of the meta level, per environment step.
         trace_decay: lambda.
         reached_reward, wrong_subgoal_reward, hazard_reward: of the sub level, for attaining the subgoal, attaining
-            another one, meeting the hazard.
+            another one, meeting the hazard (which is not read if that is 0).
         double: Double Q-learning.
         all_subgoals: ``False``: only the subgoal that was pursued learns, at both levels.
         intra_option: ``False``: the meta level learns from the steps at which options begin only.
-        max_meta_target: largest return of the task there can be, if known.
+        max_meta_target: largest return of the task there can be, if known and never negative; the meta level's targets
+            are kept between 0 and it.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -61,7 +62,7 @@ class AllSubgoalsLoss(LossModule):
     class _AcceptedKeys:
         action: NestedKey = keys.ACTION
         attained: NestedKey = keys.ATTAINED
-        hazard: NestedKey | None = keys.HAZARD
+        hazard: NestedKey = keys.HAZARD
         extrinsic_reward: NestedKey = keys.EXTRINSIC_REWARD
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
@@ -73,7 +74,17 @@ class AllSubgoalsLoss(LossModule):
     policy: AllSubgoalsPolicy
     policy_params: TensorDictParams
     target_policy_params: TensorDictParams
-    out_keys = ["loss", "sub_loss", "meta_loss", "td_error", "q_value", "target", "meta_q_value", "trained_steps"]
+    out_keys = [
+        "loss",
+        "sub_loss",
+        "meta_loss",
+        "td_error",
+        "meta_td_error",
+        "q_value",
+        "target",
+        "meta_q_value",
+        "trained_steps",
+    ]
 
     def __init__(
         self,
@@ -112,7 +123,7 @@ class AllSubgoalsLoss(LossModule):
         policy, k = self._policies[0], self.tensor_keys
         read = [policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key, k.action]
         nexts = [k.attained, k.extrinsic_reward, k.done, k.terminated, k.active_subgoal]
-        nexts += [] if k.hazard is None else [k.hazard]
+        nexts += [k.hazard] if self.hazard_reward else []
         return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -142,7 +153,7 @@ class AllSubgoalsLoss(LossModule):
     def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network."""
         policy, target_policy = self._policies
-        inputs = tensordict.select(*policy.in_keys, strict=False)
+        inputs = tensordict.select(policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
 
         def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor]:
             values = which(inputs.copy())
@@ -160,7 +171,7 @@ class AllSubgoalsLoss(LossModule):
         done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
         other = attained.sum(-1, keepdim=True) > attained.long()  # [B, T, G]
         reward = self.reached_reward * attained + self.wrong_subgoal_reward * other
-        if k.hazard is not None:
+        if self.hazard_reward:
             reward = reward + self.hazard_reward * after[k.hazard]
         return {
             "attained": attained,

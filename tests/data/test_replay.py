@@ -145,10 +145,166 @@ def test_the_device_is_that_of_the_storage():
         ({"batch_size": 0}, "batch_size must be >= 1.*got 0; "),
         ({"capacity": 3}, "capacity must hold at least slice_len=4 .* of each of 1 environments, got 3; "),
         ({"capacity": 11, "num_envs": 3}, "capacity must hold at least slice_len=4 .* 3 environments, got 11; "),
-        ({"sampling": "rows"}, "sampling must be 'steps' or 'episodes', got 'rows'; "),
+        ({"sampling": "rows"}, "sampling must be 'steps', 'episodes' or 'episode_starts', got 'rows'; "),
+        ({"sampling": "episode_starts"}, "sampling must be 'steps' or 'episodes' for rows, got 'episode_starts'"),
     ],
 )
 def test_wrong_values(settings, message):
     settings = {"capacity": 100, "slice_len": 4, "batch_size": 2} | settings
     with pytest.raises(ValueError, match=message):
         make_sequence_buffer(settings.pop("capacity"), **settings)
+
+
+@pytest.mark.parametrize("sampling", ["steps", "episodes", "episode_starts"])
+@pytest.mark.parametrize("batches", [1, 3, 5, 8, 12], ids="after {} batches".format)
+class TestState:
+    """A copy of a memory draws the same sequences, before and after it is full."""
+
+    def make(self, sampling):
+        return make_sequence_buffer(3 * 20, slice_len=4, batch_size=16, num_envs=3, sampling=sampling)
+
+    def test_a_copy_draws_and_stores_alike(self, sampling, batches):
+        stream, first, second = Stream(3), self.make(sampling), self.make(sampling)
+        second.extend(Stream(3).take(20))
+        for _ in range(batches):
+            first.extend(stream.take(6))
+        if batches > 2:
+            sample_sequences(first, 4)
+        second.load_state_dict(first.state_dict())
+        for _ in range(6):
+            if batches > 2 or len(first) > 40:
+                assert len(first) == len(second)
+                drawn = []
+                for buffer in (first, second):
+                    torch.manual_seed(batches)
+                    drawn.append(sample_sequences(buffer, 4))
+                assert (drawn[0] == drawn[1]).all()
+                if sampling != "episode_starts":
+                    check_sequences(drawn[1], 4, newest=set(zip(stream.episode, stream.step, strict=True)))
+            batch = stream.take(4)
+            first.extend(batch.clone())
+            second.extend(batch.clone())
+
+    def test_a_state_is_as_large_as_what_was_stored(self, sampling, batches):
+        buffer, stream = self.make(sampling), Stream(3)
+        for _ in range(batches):
+            buffer.extend(stream.take(6))
+        stored = buffer.state_dict()["_storage"]["stored"]
+        assert len(stored) == min(6 * batches, 20)
+
+
+def test_the_state_of_an_empty_memory():
+    first, second = (make_sequence_buffer(60, slice_len=4, batch_size=4, num_envs=3) for _ in range(2))
+    second.extend(Stream(3).take(10))
+    second.load_state_dict(first.state_dict())
+    assert len(second) == 0
+    batch = Stream(3).take(8)
+    second.extend(batch)
+    assert len(second) == 24 and sample_sequences(second, 4).shape == (4, 4)
+
+
+def test_the_state_of_a_memory_of_options():
+    first, second = (make_sequence_buffer(10, slice_len=3, batch_size=16) for _ in range(2))
+    for number in range(7):
+        first.extend(one_episode(number, 1 + number % 3))
+    second.load_state_dict(first.state_dict())
+    for number in range(7, 12):
+        drawn = []
+        for buffer in (first, second):
+            torch.manual_seed(number)
+            drawn.append(sample_sequences(buffer, 3))
+            buffer.extend(one_episode(number, 1 + number % 3))
+        assert (drawn[0] == drawn[1]).all()
+
+
+class Recorder:
+    """Feeds a buffer with a stream and remembers when, in units of steps, episodes started in each environment."""
+
+    def __init__(self, num_envs, slice_len, *, rows=40, batch_size=64):
+        self.stream, self.rows, self.slice_len, self.now = Stream(num_envs), rows, slice_len, 0
+        self.starts = []
+        settings = {"slice_len": slice_len, "batch_size": batch_size, "num_envs": num_envs}
+        self.buffer = make_sequence_buffer(rows * num_envs, sampling="episode_starts", **settings)
+
+    def extend(self, length):
+        batch = self.stream.take(length)
+        time, env = torch.arange(length) + self.now, torch.arange(self.stream.num_envs)
+        batch["time"], batch["env"] = time.expand(batch.shape).clone(), env[:, None].expand(batch.shape).clone()
+        self.starts += [(n, self.now + t) for n, t, _ in batch["is_init"].nonzero().tolist()]
+        self.now += length
+        self.buffer.extend(batch)
+
+    def valid_starts(self):
+        """(environment, time) of starts that are stored with all the steps of a slice."""
+        oldest, last = max(0, self.now - self.rows), self.now - self.slice_len
+        return {(env, time) for env, time in self.starts if oldest <= time <= last}
+
+    def sample(self):
+        return sample_sequences(self.buffer, self.slice_len)
+
+
+class TestEpisodeStarts:
+    @pytest.mark.parametrize("num_envs", [1, 3])
+    @pytest.mark.parametrize(("length", "slice_len"), [(2, 4), (7, 4), (8, 13), (3, 1), (40, 13)])
+    def test_slices_start_where_an_episode_does_and_go_on_without_a_gap(self, num_envs, length, slice_len):
+        recorder, wrapped = Recorder(num_envs, slice_len), 0
+        for _ in range(130 // length):
+            recorder.extend(length)
+            valid = recorder.valid_starts()
+            if not valid:
+                continue
+            sequences = recorder.sample()
+            assert sequences.shape == (64, slice_len)
+            assert sequences["is_init"][:, 0].all()
+            assert (sequences["time"] == sequences["time"][:, :1] + torch.arange(slice_len)).all()
+            assert (sequences["env"] == sequences["env"][:, :1]).all()
+            drawn = set(zip(sequences["env"][:, 0].tolist(), sequences["time"][:, 0].tolist(), strict=True))
+            assert drawn <= valid and len(drawn) >= min(3, len(valid))
+            wrapped += recorder.now > recorder.rows
+        assert wrapped >= 2
+
+    def test_they_run_on_into_the_next_episodes(self):
+        recorder = Recorder(3, 13)
+        recorder.extend(40)
+        sequences = recorder.sample()
+        traj, init = sequences["collector", "traj_ids"], sequences["is_init"].squeeze(-1)
+        assert (traj[:, 1:] != traj[:, :-1]).any(1).all()  # episodes last 9 steps at most
+        assert ((traj[:, 1:] != traj[:, :-1]) == init[:, 1:]).all()
+        assert ("collector", "mask") not in sequences.keys(True)
+
+    @pytest.mark.parametrize("batches", [3, 9], ids=["before", "after"])
+    def test_all_starts_are_equally_likely_before_and_after_the_ring_is_full(self, batches):
+        recorder = Recorder(2, 6, batch_size=6_000)
+        for _ in range(batches):
+            recorder.extend(11)
+        first, valid = recorder.sample()[:, 0], sorted(recorder.valid_starts())
+        found = list(zip(first["env"].tolist(), first["time"].tolist(), strict=True))
+        counts = torch.tensor([found.count(start) for start in valid]).double()
+        expected = 6_000 / len(valid)
+        assert counts.sum() == 6_000 and len(valid) > 5
+        assert ((counts - expected) ** 2 / expected).sum().item() < len(valid) + 6 * (2 * len(valid)) ** 0.5
+
+    def test_without_a_start_that_has_enough_steps_it_says_what_to_do(self):
+        recorder = Recorder(2, 12)
+        recorder.extend(10)
+        with pytest.raises(RuntimeError, match=r"slice_len=12 stored steps; update later, raise capacity or use"):
+            recorder.sample()
+        recorder.extend(2)
+        assert recorder.sample()["time"][:, 0].unique().tolist() == [0]
+
+
+@pytest.mark.parametrize("sampling", ["steps", "episodes", "episode_starts"])
+def test_a_memory_that_was_sampled_forgets_what_it_knew_when_another_is_loaded(sampling):
+    settings = {"slice_len": 4, "batch_size": 64, "num_envs": 2, "sampling": sampling}
+    source, target = (make_sequence_buffer(40, **settings) for _ in range(2))
+    stream = Stream(2)
+    target.extend(stream.take(20))
+    sample_sequences(target, 4)
+    for _ in range(2):
+        source.extend(stream.take(13))
+    target.load_state_dict(source.state_dict())
+    drawn = []
+    for buffer in (source, target):
+        torch.manual_seed(0)
+        drawn.append(sample_sequences(buffer, 4))
+    assert (drawn[0] == drawn[1]).all()

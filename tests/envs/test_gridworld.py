@@ -144,6 +144,32 @@ def test_without_a_seed_the_worlds_follow_torch():
     assert (worlds(0) != worlds(1)).any()
 
 
+@pytest.mark.parametrize("settings", [{}, {"layout": "four_rooms", "obstacle": "teleport", "num_goals": 3}], ids=str)
+def test_a_second_env_goes_on_from_the_state_of_the_first(settings):
+    first, second = (MultiGoalGridEnv(4, max_steps=6, seed=seed, **settings) for seed in (1, 2))
+    step = first.reset()
+    for _ in range(9):
+        _, step = first.step_and_maybe_reset(first.rand_action(step))
+    state = first.state_dict()
+    second.load_state_dict(state)
+    assert (second.steps == first.steps).all() and (first.steps > 0).any()
+    actions, rollouts = torch.randint(4, (20, 4)), []
+    for env in (first, second):
+        at, seen = step.clone(), []
+        for action in actions:
+            done, at = env.step_and_maybe_reset(at.set("action", action))
+            seen.append(done.clone())
+        rollouts.append(torch.stack(seen))
+    assert (rollouts[0] == rollouts[1]).all() and rollouts[0]["next", "done"].any()
+    second.load_state_dict(state)  # still that of the moment when it was taken
+    assert (second.steps == state["steps"]).all() and second.steps.max() < 6
+
+
+def test_the_state_of_another_number_of_worlds_is_refused():
+    with pytest.raises(ValueError, match="state_dict must hold 3 worlds, got 4"):
+        MultiGoalGridEnv(3).load_state_dict(MultiGoalGridEnv(4).state_dict())
+
+
 def test_set_world_wants_one_world_for_each_row():
     with pytest.raises(ValueError, match="agent must have one cell for each of the 4 worlds, got 1"):
         corridor_env(4).set_world(torch.tensor([7]), torch.tensor([[8, 9, 10]]))

@@ -1,7 +1,14 @@
 import pytest
 import torch
 
-from hdrqn_torchrl.objectives import double_q_value, smdp_target, training_mask
+from hdrqn_torchrl.objectives import (
+    double_q_value,
+    lambda_returns,
+    n_step_returns,
+    smdp_target,
+    training_mask,
+    watkins_trace,
+)
 
 NAN = float("nan")
 
@@ -79,3 +86,156 @@ def test_smdp_target(reward, terminated, next_value, gamma, steps, target):
 )
 def test_training_mask(valid, init, burn_in, exact, mask):
     assert training_mask(flags(valid), flags(init), burn_in, exact).tolist() == flags(mask).tolist()
+
+
+def row(text):
+    """``"1 0 nan"`` -> [[1.0, 0.0, nan]]."""
+    return torch.tensor([[float(number) for number in text.split()]])
+
+
+@pytest.mark.parametrize(
+    ("reward", "ended", "next_value", "trace", "discount", "targets"),
+    [
+        # lambda 0 is the one-step target.
+        ("1 0 2", "000", "4 8 6", "0 0 0", 0.5, "3 4 5"),
+        # lambda 1 without cuts sums up the rewards and takes the last value: 1 + 0.5 * 0 + 0.25 * 2 + 0.125 * 6.
+        ("1 0 2", "000", "4 8 6", "1 1 1", 0.5, "2.25 2.5 5"),
+        ("1 0 2", "000", "4 8 6", "1 1 0", 0.5, "2.25 2.5 5"),  # the last trace has nothing to take over
+        ("1 0 2", "000", "4 8 6", "0.5 0.5 0.5", 0.5, "2.8125 3.25 5"),
+        # Cuts.
+        ("1 0 2", "000", "4 8 6", "0.5 0 0.5", 0.5, "3 4 5"),
+        ("1 0 2", "000", "4 8 6", "0 0.5 0.5", 0.5, "3 3.25 5"),
+        ("1 0 2", "000", "4 8 6", "1 0 1", 0.5, "3 4 5"),
+        # Ends: what follows is not read, and the step before takes over the bare reward.
+        ("1 0 2", "010", "4 nan 6", "1 1 1", 0.5, "1 0 5"),
+        ("1 0 2", "010", "4 nan 6", "0.5 0.5 0.5", 0.5, "2 0 5"),
+        ("1 0 2", "001", "4 8 nan", "1 1 1", 0.5, "1.5 1 2"),
+        ("1 0 2", "111", "nan nan nan", "1 1 1", 0.5, "1 0 2"),
+        # A discount for each transition (options of 1, 2 and 3 steps).
+        ("1 0 2", "000", "4 8 6", "0 0 0", "0.5 0.25 0.125", "3 2 2.75"),
+        ("1 0 2", "000", "4 8 6", "1 1 1", "0.5 0.25 0.125", "1.34375 0.6875 2.75"),
+        ("1 0 2", "000", "4 8 6", "1 1 1", 0.0, "1 0 2"),
+        ("3", "0", "4", "1", 0.5, "5"),
+        ("3", "1", "nan", "1", 0.5, "3"),
+    ],
+)
+def test_lambda_returns(reward, ended, next_value, trace, discount, targets):
+    discount = row(discount) if isinstance(discount, str) else discount
+    found = lambda_returns(row(reward), flags(ended), row(next_value), row(trace), discount)
+    torch.testing.assert_close(found, row(targets), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("greedy", "trace"),
+    [
+        ("111", "0.5 0.5 0"),
+        ("011", "0.5 0.5 0"),  # whether the first action is greedy concerns no target
+        ("101", "0 0.5 0"),
+        ("110", "0.5 0 0"),
+        ("000", "0 0 0"),
+        ("1", "0"),
+    ],
+)
+def test_watkins_trace(greedy, trace):
+    assert watkins_trace(flags(greedy), 0.5).tolist() == row(trace).tolist()
+
+
+@pytest.mark.parametrize(
+    ("reward", "ended", "next_value", "follows", "n", "targets"),
+    [
+        ("1 0 2", "000", "4 8 6", "111", 1, "3 4 5"),
+        ("1 0 2", "000", "4 8 6", "111", 2, "3 2.5 5"),  # 1 + 0.5 * 0 + 0.25 * 8
+        ("1 0 2", "000", "4 8 6", "111", 3, "2.25 2.5 5"),
+        ("1 0 2", "000", "4 8 6", "111", 9, "2.25 2.5 5"),  # shorter at the end of the sequence
+        ("1 0 2", "010", "4 nan 6", "111", 2, "1 0 5"),
+        ("1 0 2", "010", "4 nan 6", "101", 3, "1 0 5"),
+        ("1 0 2", "000", "4 8 6", "011", 3, "3 2.5 5"),
+        ("1 0 2", "000", "4 8 6", "101", 3, "3 4 5"),  # 1 + 0.5 * (0 + 0.5 * 8)
+        ("1 0 2", "000", "4 8 6", "000", 3, "3 4 5"),
+    ],
+)
+def test_n_step_returns(reward, ended, next_value, follows, n, targets):
+    found = n_step_returns(row(reward), flags(ended), row(next_value), flags(follows), 0.5, n)
+    torch.testing.assert_close(found, row(targets), rtol=0, atol=1e-6)
+
+
+def test_n_step_returns_with_a_discount_for_each_transition():
+    found = n_step_returns(row("1 0 2"), flags("000"), row("4 8 6"), flags("111"), row("0.5 0.25 0.125"), 2)
+    assert found.tolist() == row("2 0.6875 2.75").tolist()  # 1 + 0.5 * (0 + 0.25 * 8)
+
+
+@pytest.mark.parametrize("n", [0, -1])
+def test_n_step_returns_of_no_step(n):
+    with pytest.raises(ValueError, match=f"n must be >= 1 step, got {n}; "):
+        n_step_returns(row("1"), flags("0"), row("1"), flags("1"), 0.5, n)
+
+
+class TestAgainstPlainLoops:
+    """Random sequences ``[B, T, G]`` with ends and cuts."""
+
+    SHAPE = (4, 9, 3)
+
+    @pytest.fixture(autouse=True)
+    def random_sequences(self):
+        self.reward, self.next_value = torch.randn(2, *self.SHAPE)
+        self.ended = torch.rand(self.SHAPE) < 0.2
+        self.greedy = torch.rand(self.SHAPE) < 0.6
+        self.discount = torch.rand(self.SHAPE)
+
+    def check(self, found, target):
+        """``target(r, e, v, f, d, t)`` computes one target from lists along time."""
+        for b in range(self.SHAPE[0]):
+            for g in range(self.SHAPE[2]):
+                columns = (self.reward, self.ended, self.next_value, self.greedy, self.discount)
+                lists = [column[b, :, g].tolist() for column in columns]
+                wanted = [target(*lists, t) for t in range(self.SHAPE[1])]
+                assert found[b, :, g].tolist() == pytest.approx(wanted, abs=1e-5)
+
+    @pytest.mark.parametrize("trace_decay", [0.0, 0.3, 1.0])
+    def test_watkins_q_lambda(self, trace_decay):
+        def target(reward, ended, value, greedy, discount, t):
+            if ended[t]:
+                return reward[t]
+            if t + 1 == len(reward) or not greedy[t + 1]:
+                return reward[t] + discount[t] * value[t]
+            later = target(reward, ended, value, greedy, discount, t + 1)
+            return reward[t] + discount[t] * ((1 - trace_decay) * value[t] + trace_decay * later)
+
+        trace = watkins_trace(self.greedy, trace_decay)
+        self.check(lambda_returns(self.reward, self.ended, self.next_value, trace, self.discount), target)
+
+    @pytest.mark.parametrize("n", [1, 2, 4, 20])
+    def test_n_steps(self, n):
+        def target(reward, ended, value, follows, discount, t):
+            total, weight = 0.0, 1.0
+            for step in range(t, min(t + n, len(reward))):
+                total += weight * reward[step]
+                weight *= discount[step]
+                if ended[step]:
+                    return total
+                if not follows[step]:
+                    break
+            return total + weight * value[step]
+
+        found = n_step_returns(self.reward, self.ended, self.next_value, self.greedy, self.discount, n)
+        self.check(found, target)
+
+    def test_the_lambda_return_is_the_mean_of_the_n_step_returns(self):
+        """The forward view, weights (1 - lambda) lambda^(n - 1); the longest return has what is left."""
+        length, share = self.SHAPE[1], 0.7
+        always = torch.ones_like(self.ended)
+        mean = 0.0
+        for n in range(1, length + 1):
+            returns = n_step_returns(self.reward, self.ended, self.next_value, always, self.discount, n)
+            mean = mean + (share ** (n - 1) * (1 - share if n < length else 1.0)) * returns
+        trace = share * always.float()
+        found = lambda_returns(self.reward, self.ended, self.next_value, trace, self.discount)
+        torch.testing.assert_close(found, mean)
+
+    def test_nothing_that_is_given_is_changed(self):
+        trace = watkins_trace(self.greedy, 0.5)
+        given = (self.reward, self.ended, self.next_value, trace, self.discount)
+        copies = [tensor.clone() for tensor in given]
+        lambda_returns(*given)
+        n_step_returns(self.reward, self.ended, self.next_value, self.greedy, self.discount, 3)
+        assert all((tensor == copy).all() for tensor, copy in zip(given, copies, strict=True))

@@ -1,0 +1,456 @@
+"""The loss on networks that are mere tables of values, against plain loops; then on real ones."""
+
+import math
+from itertools import product
+from types import SimpleNamespace
+
+import pytest
+import torch
+from helpers import collect, parameter_distance, small_env, tiny_settings
+from tensordict import TensorDict
+from torch import nn
+
+from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.modules import AllSubgoalsPolicy, compact_network
+from hdrqn_torchrl.objectives import AllSubgoalsLoss
+
+B, T, G, A = 12, 14, 3, 3
+DEFAULTS = {
+    "sub_gamma": 0.95,
+    "meta_gamma": 0.97,
+    "trace_decay": 0.8,
+    "reached_reward": 1.0,
+    "wrong_subgoal_reward": -0.5,
+    "hazard_reward": -1.0,
+    "double": True,
+    "all_subgoals": True,
+    "intra_option": True,
+    "max_meta_target": None,
+}
+# Where each argument changes the loss on the random sequences below.
+CHANGES = [
+    {"sub_gamma": 0.5},
+    {"meta_gamma": 0.5},
+    {"trace_decay": 0.0},
+    {"trace_decay": 1.0},
+    {"reached_reward": 0.25},
+    {"wrong_subgoal_reward": 0.0},
+    {"hazard_reward": 0.0},
+    {"double": False},
+    {"all_subgoals": False},
+    {"intra_option": False},
+    {"all_subgoals": False, "intra_option": False},
+    {"max_meta_target": 0.4},
+]
+
+
+class Tables(nn.Module):
+    """A "network" whose values at a step are free parameters; the observation is the number of the step."""
+
+    hidden_size = 1
+
+    def __init__(self, steps, subgoals=G, actions=A):
+        super().__init__()
+        self.action_value = nn.Parameter(torch.randn(steps, subgoals, actions))
+        self.subgoal_value = nn.Parameter(torch.randn(steps, subgoals))
+
+    def unroll(self, observation, previous_action, init, mask):
+        return self.action_value[observation], self.subgoal_value[observation]
+
+
+def make_loss(steps=B * T, *, subgoals=G, actions=A, **settings):
+    """A loss and its two tables; the target's values are others than the main ones."""
+    loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(steps, subgoals, actions)), **settings)
+    with torch.no_grad():
+        for value in loss.target_policy_params.values(True, True):
+            if value.numel() > 1:
+                value.copy_(torch.randn_like(value))
+    return loss
+
+
+def tables(loss):
+    main, target = loss.policy_params["network"], loss.target_policy_params["network"]
+    return [main["action_value"], main["subgoal_value"], target["action_value"], target["subgoal_value"]]
+
+
+def in_sequences(loss):
+    """The tables as ``[B, T, ...]``."""
+    return [table.unflatten(0, (-1, T)) for table in tables(loss)]
+
+
+def play(loss, seed=0):
+    """Random sequences ``[B, T]`` of several episodes each, mostly greedy for the subgoal pursued."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def chance(probability):
+        return torch.rand((), generator=generator).item() < probability
+
+    def choice(options):
+        return options[int(torch.randint(len(options), (), generator=generator))]
+
+    rows = [_play_row(tables(loss)[0], b * T, chance, choice) for b in range(B)]
+    td = TensorDict(
+        {key: torch.tensor([[step[key] for step in row] for row in rows]) for key in rows[0][0]}, batch_size=(B, T)
+    )
+    flags = ("is_init", "option_init", "hazard", "done", "terminated", "extrinsic_reward")
+    after = ("attained", "hazard", "done", "terminated", "extrinsic_reward", "active_subgoal")
+    td.update({key: td[key].unsqueeze(-1) for key in flags})
+    td["next"] = td.select(*after)
+    td = td.exclude(*after)
+    td["previous_action"] = torch.zeros(B, T, dtype=torch.int64)
+    return td
+
+
+def _play_row(action_value, first, chance, choice):
+    row, new_episode, subgoal = [], True, 0
+    for t in range(T):
+        if new_episode:
+            left, starts = [True] * G, True
+        subgoal = choice([g for g in range(G) if left[g]]) if starts else subgoal
+        greedy = action_value[first + t, subgoal].argmax().item()
+        attained = [left[g] and chance(0.12) for g in range(G)]
+        now = {"observation": first + t, "is_init": new_episode, "option_init": starts, "subgoal_mask": list(left)}
+        now |= {"active_subgoal": subgoal, "attained": attained, "hazard": chance(0.15)}
+        now |= {"action": greedy if chance(0.75) else choice(range(A)), "extrinsic_reward": choice([0.0, 0.01, 1.0])}
+        left = [was and not reached for was, reached in zip(left, attained, strict=True)]
+        terminated, truncated = not any(left) or chance(0.05), chance(0.08)
+        new_episode = terminated or truncated
+        starts = attained[subgoal] or not left[subgoal] or chance(0.1)
+        row.append(now | {"terminated": terminated, "done": new_episode})
+    return row
+
+
+class Reference:
+    """The equations of the module's docstring, step by step and subgoal by subgoal."""
+
+    def __init__(self, values, td, **settings):
+        self.s = SimpleNamespace(**(DEFAULTS | settings))
+        self.q, self.m, self.target_q, self.target_m = (value.tolist() for value in values)
+        self.rows, self.steps, self.subgoals = td["subgoal_mask"].shape
+        self.action = td["action"].tolist()
+        self.left, self.starts = td["subgoal_mask"].tolist(), td["option_init"].squeeze(-1).tolist()
+        after = td["next"]
+        self.attained, self.subgoal = after["attained"].tolist(), after["active_subgoal"].tolist()
+        names = ("hazard", "done", "terminated", "extrinsic_reward")
+        self.hazard, self.done, self.terminated, self.extrinsic = (after[key].squeeze(-1).tolist() for key in names)
+
+    def run(self):
+        """Errors of all trained entries by (row, time, subgoal), of the sub level and of the meta level."""
+        sub, meta = {}, {}
+        for b, t, g in product(range(self.rows), range(self.steps - 1), range(self.subgoals)):
+            if self.trains_sub(b, t, g):
+                target = min(self.sub_target(b, t, g), self.s.reached_reward)
+                sub[b, t, g] = self.q[b][t][g][self.action[b][t]] - target
+            if self.trains_meta(b, t, g):
+                target = self.meta_target(b, t, g)
+                if self.s.max_meta_target is not None:
+                    target = min(max(target, 0.0), self.s.max_meta_target)
+                meta[b, t, g] = self.m[b][t][g] - target
+        return sub, meta
+
+    def cut_off(self, b, t):
+        return self.done[b][t] and not self.terminated[b][t]
+
+    def greedy(self, b, t, g):
+        values = self.q[b][t][g]
+        return self.action[b][t] == values.index(max(values))
+
+    def trains_sub(self, b, t, g):
+        pursued = self.s.all_subgoals or g == self.subgoal[b][t]
+        known = self.attained[b][t][g] or not self.cut_off(b, t)
+        return self.left[b][t][g] and known and pursued
+
+    def trains_meta(self, b, t, g):
+        pursued = g == self.subgoal[b][t]
+        belongs = pursued or self.greedy(b, t, g)
+        if not self.s.all_subgoals:
+            belongs = pursued
+        if not self.s.intra_option:
+            belongs = pursued and self.starts[b][t]
+        return self.left[b][t][g] and not self.cut_off(b, t) and belongs
+
+    def sub_target(self, b, t, g):
+        reward = self.s.reached_reward if self.attained[b][t][g] else 0.0
+        if any(self.attained[b][t][other] for other in range(self.subgoals) if other != g):
+            reward += self.s.wrong_subgoal_reward
+        if self.hazard[b][t]:
+            reward += self.s.hazard_reward
+        if self.attained[b][t][g] or self.terminated[b][t]:
+            return reward
+        chooser = (self.q if self.s.double else self.target_q)[b][t + 1][g]
+        value = self.target_q[b][t + 1][g][chooser.index(max(chooser))]
+        unknown = self.cut_off(b, t + 1) and not self.attained[b][t + 1][g]
+        following = self.mixed(b, t, g, value, self.sub_target, unknown)
+        return reward + self.s.sub_gamma * following
+
+    def meta_target(self, b, t, g):
+        if self.terminated[b][t]:
+            return self.extrinsic[b][t]
+        value = self.target_m[b][t + 1]
+        if self.attained[b][t][g]:
+            chooser = (self.m if self.s.double else self.target_m)[b][t + 1]
+            left = [other for other in range(self.subgoals) if self.left[b][t + 1][other]]
+            following = value[max(left, key=lambda other: chooser[other])]
+        else:
+            following = self.mixed(b, t, g, value[g], self.meta_target, self.cut_off(b, t + 1))
+        return self.extrinsic[b][t] + self.s.meta_gamma * following
+
+    def mixed(self, b, t, g, value, target, unknown):
+        if t + 1 == self.steps - 1 or unknown or not self.greedy(b, t + 1, g):
+            return value
+        return (1 - self.s.trace_decay) * value + self.s.trace_decay * target(b, t + 1, g)
+
+
+def mean_square(errors):
+    return sum(error**2 for error in errors.values()) / len(errors)
+
+
+class TestAgainstPlainLoops:
+    @pytest.mark.parametrize("seed", [0, 1])
+    @pytest.mark.parametrize("settings", [{}, *CHANGES], ids=str)
+    def test_losses_targets_and_masks(self, settings, seed):
+        """A table's gradient at an entry is 2 (value - target) / count where it is trained, and 0 elsewhere."""
+        torch.manual_seed(seed)
+        loss = make_loss(**settings)
+        td = play(loss, seed)
+        result = loss(td.clone())
+        result["loss"].backward()
+        sub, meta = Reference(in_sequences(loss), td, **settings).run()
+        assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-5)
+        assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-5)
+        assert result["loss"].item() == pytest.approx(mean_square(sub) + mean_square(meta), rel=1e-5)
+
+        action_value, subgoal_value, *_ = tables(loss)
+        expected_sub, expected_meta = torch.zeros_like(action_value), torch.zeros_like(subgoal_value)
+        for (b, t, g), error in sub.items():
+            expected_sub[b * T + t, g, td["action"][b, t]] = 2 * error / len(sub)
+        for (b, t, g), error in meta.items():
+            expected_meta[b * T + t, g] = 2 * error / len(meta)
+        torch.testing.assert_close(action_value.grad, expected_sub, rtol=1e-4, atol=1e-7)
+        torch.testing.assert_close(subgoal_value.grad, expected_meta, rtol=1e-4, atol=1e-7)
+
+    def test_the_report(self):
+        loss = make_loss()
+        td = play(loss)
+        result = loss(td)
+        sub, meta = Reference(in_sequences(loss), td).run()
+        action_value, subgoal_value, *_ = tables(loss)
+        values = [action_value[b * T + t, g, td["action"][b, t]].item() for b, t, g in sub]
+        assert set(result.keys()) == set(loss.out_keys)
+        assert result["trained_steps"] == len(sub)
+        assert result["td_error"].item() == pytest.approx(sum(map(abs, sub.values())) / len(sub), rel=1e-5)
+        assert result["meta_td_error"].item() == pytest.approx(sum(map(abs, meta.values())) / len(meta), rel=1e-5)
+        assert result["q_value"].item() == pytest.approx(sum(values) / len(sub), rel=1e-4)
+        assert result["target"].item() == pytest.approx((sum(values) - sum(sub.values())) / len(sub), rel=1e-4)
+        meta_values = [subgoal_value[b * T + t, g].item() for b, t, g in meta]
+        assert result["meta_q_value"].item() == pytest.approx(sum(meta_values) / len(meta), rel=1e-4)
+        assert [name for name, value in result.items() if value.requires_grad] == ["loss"]
+
+    def test_the_sequences_hold_every_case(self):
+        td = play(make_loss())
+        after = td["next"][:, :-1]
+        done, terminated = after["done"].squeeze(-1), after["terminated"].squeeze(-1)
+        attained = after["attained"]
+        pursued = attained.gather(-1, after["active_subgoal"].unsqueeze(-1)).squeeze(-1)
+        several = attained.sum(-1) > 1
+        for case in (done & ~terminated, terminated & td["subgoal_mask"][:, :-1].any(-1), pursued, several):
+            assert case.sum() >= 2
+        assert (attained.any(-1) & done & ~terminated).any() and (attained.any(-1) & ~pursued).any()
+        inside = ~td["option_init"].squeeze(-1)
+        assert inside[:, -1].any() and after["hazard"].any() and td["is_init"].sum() > 2 * B
+
+    @pytest.mark.parametrize("settings", CHANGES, ids=str)
+    def test_every_argument_changes_the_loss(self, settings):
+        losses = []
+        for changed in ({}, settings):
+            torch.manual_seed(0)
+            loss = make_loss(**changed)
+            losses.append(loss(play(loss))["loss"].item())
+        assert not math.isclose(*losses, rel_tol=1e-4)
+
+
+def hand_made(actions, **events):
+    """One sequence, one subgoal, two actions; nothing happens but the ``events`` at the times given."""
+    steps = len(actions)
+    td = TensorDict(observation=torch.arange(steps)[None], batch_size=(1, steps))
+    td["action"] = torch.tensor([[int(action) for action in actions]])
+    td["previous_action"] = torch.zeros(1, steps, dtype=torch.int64)
+    td["is_init"] = td["option_init"] = (torch.arange(steps) == 0).view(1, steps, 1)
+    td["subgoal_mask"] = torch.ones(1, steps, 1, dtype=torch.bool)
+    no = torch.zeros(1, steps, 1, dtype=torch.bool)
+    after = {key: no.clone() for key in ("attained", "hazard", "done", "terminated")}
+    after["extrinsic_reward"] = torch.zeros(1, steps, 1)
+    after["active_subgoal"] = torch.zeros(1, steps, dtype=torch.int64)
+    td["next"] = TensorDict(after, batch_size=(1, steps))
+    for key, time in events.items():
+        td["next", key][0, time] = 1
+    return td
+
+
+END = {"done": 1, "terminated": 1}
+
+
+@pytest.mark.parametrize(
+    ("actions", "events", "sub", "meta"),
+    [
+        # Values that follow are 0.8 (sub) and 4 (meta), discounts and lambda 0.5, action 0 is the greedy one.
+        # 0.3 = 0.5 (0.5 * 0.8 + 0.5 * 0.4); 0.275 = 0.5 (0.5 * 0.8 + 0.5 * 0.3); 1.5 = 0.5 (0.5 * 4 + 0.5 * 2).
+        ("0000", {}, [0.275, 0.3, 0.4], [1.375, 1.5, 2.0]),
+        ("0001", {}, [0.275, 0.3, 0.4], [1.375, 1.5, 2.0]),  # the lookahead's action cuts nothing that is taken over
+        ("0100", {}, [0.4, 0.3, 0.4], [2.0, 1.5, 2.0]),  # Watkins' cut: the step before an exploratory one
+        ("0010", {}, [0.3, 0.4, 0.4], [1.5, 2.0, 2.0]),
+        ("0000", {"hazard": 1}, [0.025, -0.7, 0.4], [1.375, 1.5, 2.0]),
+        ("0000", {"extrinsic_reward": 1}, [0.275, 0.3, 0.4], [1.625, 2.5, 2.0]),
+        ("0000", {"attained": 1, "extrinsic_reward": 1, **END}, [0.45, 1.0, 0.4], [1.25, 1.0, 2.0]),
+        ("0000", END, [0.2, 0.0, 0.4], [1.0, 0.0, 2.0]),
+        # A time limit is no end: its own step is not trained, and the one before takes the value alone.
+        ("0000", {"done": 1}, [0.4, None, 0.4], [2.0, None, 2.0]),
+        ("0000", {"done": 1, "attained": 1}, [0.45, 1.0, 0.4], [2.0, None, 2.0]),
+        ("0000", {"done": 2}, [0.3, 0.4, None], [1.5, 2.0, None]),
+        ("0000", {"done": 2, "terminated": 2}, [0.25, 0.2, 0.0], [1.25, 1.0, 0.0]),
+        # An option that ends in mid-episode goes on with the best that is left.
+        ("0000", {"attained": 1}, [0.45, 1.0, 0.4], [1.5, 2.0, 2.0]),
+        # What the lookahead led to is not read.
+        ("0000", {"attained": 3, "hazard": 3, "extrinsic_reward": 3}, [0.275, 0.3, 0.4], [1.375, 1.5, 2.0]),
+        ("0000", {"done": 3, "terminated": 3}, [0.275, 0.3, 0.4], [1.375, 1.5, 2.0]),
+    ],
+)
+def test_targets_by_hand(actions, events, sub, meta):
+    loss = make_loss(4, subgoals=1, actions=2, sub_gamma=0.5, meta_gamma=0.5, trace_decay=0.5)
+    with torch.no_grad():
+        for table, value in zip(tables(loss), ([1.0, 0.0], [0.0], [0.8, 8.0], [4.0]), strict=True):
+            table.copy_(torch.tensor(value).expand_as(table))
+    loss(hand_made(actions, **events))["loss"].backward()
+    action_value, subgoal_value, *_ = tables(loss)
+    values = [1.0 - int(action) for action in actions]
+    check_gradient(action_value.grad.sum((1, 2)), values, sub)
+    check_gradient(subgoal_value.grad.sum(1), [0.0] * 4, meta)
+
+
+def check_gradient(grad, values, targets):
+    """2 (value - target) / count where there is a target, else 0; 0 for the lookahead."""
+    count = sum(target is not None for target in targets)
+    errors = [0.0 if y is None else value - y for value, y in zip(values, targets, strict=False)]
+    assert grad.tolist() == pytest.approx([2 * error / count for error in errors] + [0.0], abs=1e-6)
+
+
+class TestInTheEnvironment:
+    """On sequences that real play left in the memory, with a real network."""
+
+    def sample(self, **options):
+        torch.manual_seed(0)
+        env = small_env(8, max_steps=6, view=5)
+        settings = tiny_settings(sampling="episode_starts", slice_len=10, batch_size=32, learning_rate=1e-2)
+        algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, memory_size=8, head_size=8, **options)
+        self.learner = algorithm.learners["joint"]
+        for batch in collect(algorithm, env, 20, batches=2):
+            self.learner.store(batch)
+        for _ in range(6):  # values that differ, and a target that lags behind
+            self.learner.update(self.learner.sample())
+        self.learner.optimizer.zero_grad()
+        return self.learner.loss, self.learner.sample()
+
+    def values(self, loss, td):
+        """By the main and the target network, ``[B, T, G, A]`` and ``[B, T, G]`` each."""
+        with torch.no_grad():
+            return [value for pair in loss._values(td) for value in pair]
+
+    @pytest.mark.parametrize("options", [{}, {"max_option_steps": 2, "trace_decay": 1.0}], ids=str)
+    def test_losses(self, options):
+        loss, td = self.sample(**options)
+        result = loss(td)
+        sub, meta = Reference(self.values(loss, td), td, trace_decay=options.get("trace_decay", 0.8)).run()
+        assert result["trained_steps"] == len(sub) > 200 and len(meta) > 100
+        assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-4)
+        assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-4)
+
+    def test_the_gradient_is_that_of_the_errors_and_of_no_target(self):
+        """Targets are numbers: the reference differentiates the values alone."""
+        loss, td = self.sample()
+        sub, meta = Reference(self.values(loss, td), td).run()
+        network = self.learner.network.network
+        loss(td)["loss"].backward()
+        found = {name: p.grad.clone() for name, p in network.named_parameters()}
+        network.zero_grad()
+        inputs = (td["observation"], td["previous_action"], td["is_init"].squeeze(-1), td["subgoal_mask"])
+        action_value, subgoal_value = network.unroll(*inputs)
+        total = 0.0
+        for (b, t, g), error in sub.items():
+            total = total + 2 * error / len(sub) * action_value[b, t, g, td["action"][b, t]]
+        for (b, t, g), error in meta.items():
+            total = total + 2 * error / len(meta) * subgoal_value[b, t, g]
+        total.backward()
+        for name, parameter in network.named_parameters():
+            torch.testing.assert_close(found[name], parameter.grad, rtol=1e-3, atol=1e-6)
+        assert all(not p.requires_grad for p in loss.target_policy_params.values(True, True))
+
+    @pytest.mark.parametrize("joint", [True, False])
+    def test_whether_the_meta_loss_reaches_the_memory(self, joint):
+        loss, td = self.sample(joint=joint)
+        network = self.learner.network.network
+        with torch.no_grad():
+            network.sub_head[2].weight.zero_()  # no way to the memory through the sub level
+        loss(td)["loss"].backward()
+        moved = {name for name, p in network.named_parameters() if p.grad is not None and (p.grad != 0).any()}
+        assert any(name.startswith(("memory", "features")) for name in moved) == joint
+        assert {"meta_head.0.weight", "sub_head.2.bias"} <= moved
+
+    def test_the_target_moves_by_the_updater_only(self):
+        loss, td = self.sample()
+        before = loss.target_policy_params.data.clone()
+        loss(td)["loss"].backward()
+        self.learner.optimizer.step()
+        assert parameter_distance(before, loss.target_policy_params.data) == 0
+        self.learner.target_updater.step()
+        tau = self.learner.settings.tau
+        for key, weight in loss.policy_params.items(True, True):
+            if weight.requires_grad:
+                moved = before[key].lerp(weight, tau)
+                torch.testing.assert_close(loss.target_policy_params[key], moved, rtol=0, atol=1e-6)
+        assert parameter_distance(before, loss.target_policy_params.data) > 0
+
+    @pytest.mark.parametrize("hazard_reward", [-1.0, 0.0])
+    def test_it_reads_what_it_asks_for_and_nothing_else(self, hazard_reward):
+        loss, td = self.sample(hazard_reward=hazard_reward, intra_option=False)
+        whole, needed = loss(td), td.select(*loss.in_keys)
+        assert len(needed.keys(True, True)) == len(loss.in_keys) == 12 - (hazard_reward == 0.0)
+        assert loss(needed)["loss"] == whole["loss"]
+        for key in loss.in_keys:
+            with pytest.raises(KeyError):
+                loss(needed.exclude(key))
+
+    def test_keys_can_be_others_and_nested(self):
+        loss, td = self.sample()
+        expected = loss(td)["loss"]
+        for key in ("action", "option_init"):
+            td[f"agent_{key}", "x"] = td.pop(key)
+        for key in ("attained", "hazard", "extrinsic_reward", "done", "terminated", "active_subgoal"):
+            td["next", f"agent_{key}", "x"] = td["next"].pop(key)
+        moved = {key: (f"agent_{key}", "x") for key in loss.default_keys.__dataclass_fields__}
+        loss.set_keys(**moved)
+        assert len(moved) == 8 and loss(td)["loss"] == expected
+
+
+def test_everything_stays_on_the_device():
+    """Mixing devices raises an error."""
+    loss = make_loss()
+    td = play(loss).to("meta")
+    loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(B * T)).to("meta"), max_meta_target=1.0)
+    assert loss(td)["loss"].device.type == "meta"
+
+
+def test_sequences_without_anything_to_train():
+    """All of it cut off by time limits: the loss is 0 and no NaN."""
+    loss = make_loss()
+    td = play(loss)
+    td["next", "done"][:], td["next", "terminated"][:], td["next", "attained"][:] = True, False, False
+    result = loss(td)
+    assert result["loss"] == 0 and result["trained_steps"] == 0
+    assert all(torch.isfinite(value) for value in result.values())
+
+
+@pytest.mark.parametrize("name", ["sub_gamma", "meta_gamma", "trace_decay"])
+@pytest.mark.parametrize("value", [-0.1, 1.1])
+def test_wrong_values(name, value):
+    with pytest.raises(ValueError, match=rf"{name} must lie in \[0, 1\], got {value}; "):
+        make_loss(**{name: value})

@@ -1,0 +1,242 @@
+"""A training that was stopped and resumed is, bit for bit, the one that was not."""
+
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+
+import pytest
+from helpers import check_same, check_same_checkpoint, make_training, seed_everything, table
+
+from hdrqn_torchrl import checkpoint
+from hdrqn_torchrl.checkpoint import Checkpoints
+from hdrqn_torchrl.interruption import Interrupted
+
+BATCH = 32  # frames; see make_training
+TRAININGS = {
+    "drqn": partial(make_training, name="drqn", learner={"sampling": "episodes", "max_grad_norm": 0.5}),
+    "v1": partial(
+        make_training,
+        name="v1",
+        learner={"learning_rate_end": 1e-3, "learning_rate_frames": 200, "slice_len": 2, "loss_function": "smooth_l1"},
+    ),
+    "v2": partial(make_training, name="v2"),
+    "v2-refreshed": partial(make_training, name="v2", options={"refresh_hidden_steps": 7}),
+    "v3": partial(make_training, name="v3", learner={"slice_len": 2}),
+}
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A stop request that arrives as a method is called."""
+
+    method: Callable  # trainer -> owner and name of the method
+    when: Callable  # trainer -> whether it is this call
+    holds: Callable  # checks, on the stopped trainer, that the cut is what its name says
+
+    def arm(self, trainer, action=partial(signal.raise_signal, signal.SIGTERM)):  # noqa: B008
+        """``action`` happens once."""
+        owner, name = self.method(trainer)
+        method = getattr(owner, name)
+
+        def cutting(*args, **kwargs):
+            if self.when(trainer):
+                setattr(owner, name, method)
+                action()
+            return method(*args, **kwargs)
+
+        setattr(owner, name, cutting)
+
+
+def level(trainer, number):
+    """A learner; flat algorithms have only one."""
+    learners = list(trainer.algorithm.learners.values())
+    return learners[min(number, len(learners) - 1)]
+
+
+def before_updates_of(batch, holds):
+    return Cut(lambda trainer: (level(trainer, 1), "store"), lambda trainer: trainer.frames == batch * BATCH, holds)
+
+
+def after_updates_of(batch, holds):
+    def method(trainer):
+        return trainer.collector, "update_policy_weights_"
+
+    return Cut(method, lambda trainer: trainer.frames == batch * BATCH, holds)
+
+
+def between_updates(number, updates, holds):
+    def when(trainer):
+        return level(trainer, number).updates == updates
+
+    return Cut(lambda trainer: (level(trainer, number), "update"), when, holds)
+
+
+def in_evaluation_after(batch, holds):
+    return Cut(lambda trainer: (trainer, "evaluate"), lambda trainer: trainer.frames == batch * BATCH, holds)
+
+
+def at(trainer, *, batch, rows, updates_each):
+    """Counters of all parts."""
+    assert (trainer.frames, trainer.logger.csv.rows) == (batch * BATCH, rows)
+    assert {learner.updates for learner in trainer.algorithm.learners.values()} == set(updates_each)
+
+
+def owed(trainer, *, number, dues):
+    """Updates that are left of the iteration, and the minibatches that were drawn for them."""
+    left = tuple(learner.updates_due() for learner in trainer.algorithm.learners.values())
+    assert left == (dues if len(left) > 1 else (dues[number],))
+    assert level(trainer, number).state_dict()["drawn"]
+
+
+def options_in_progress(trainer):
+    steps = trainer.collector.env.base_env.steps
+    assert ((steps > 0) & (steps < 7)).any()
+    assert trainer.state_dict()["tracker"]["sums"]["steps"].tolist() == steps.tolist()
+    if len(trainer.algorithm.learners) > 1:
+        options = level(trainer, 1).extract.state_dict()
+        assert options["is_open"].any() and len(options["held"])  # in progress; done, but their episode is not
+        carrier = trainer.collector.state_dict()["carrier"]
+        assert (carrier["option_steps"] > 0).any() and carrier["meta_hidden"].any()
+
+
+def memories_wrapped(trainer):
+    """Every replay memory is full and was written over from its beginning on."""
+    for learner in trainer.algorithm.learners.values():
+        assert len(learner.buffer) == 40
+        assert 0 < learner.buffer.state_dict()["_writer"]["_cursor"] < len(learner.buffer.storage[:])
+
+
+CUTS = {
+    "in the first evaluation": in_evaluation_after(0, partial(at, batch=0, rows=0, updates_each=[0])),
+    "during warm-up": after_updates_of(1, partial(at, batch=1, rows=1, updates_each=[0])),
+    "before the first update": before_updates_of(3, partial(at, batch=3, rows=1, updates_each=[0])),
+    "between two updates": between_updates(0, 1, partial(owed, number=0, dues=(2, 4))),
+    "between two updates of the other level": between_updates(1, 6, partial(owed, number=1, dues=(0, 1))),
+    "in an evaluation": in_evaluation_after(4, partial(at, batch=4, rows=2, updates_each=[8])),
+    "in the middle of options": after_updates_of(5, options_in_progress),
+    "behind a row of metrics": after_updates_of(6, partial(at, batch=6, rows=4, updates_each=[16])),
+    "with full memories": after_updates_of(7, memories_wrapped),
+    "in the last batch": before_updates_of(8, partial(at, batch=8, rows=4, updates_each=[20])),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory_for_disk():
+    """What is tested here does not depend on fsync, which takes most of the time of a small checkpoint."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint.os, "fsync", lambda _: None)
+        yield
+
+
+FEW = ("between two updates", "in the middle of options", "with full memories")
+PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
+PAIRS += [(training, cut) for training in ("v2-refreshed", "v3") for cut in FEW]
+
+
+@pytest.fixture(scope="module")
+def prepare(tmp_path_factory):
+    """Trains once without a stop and once with all of them."""
+
+    @cache
+    def prepare(name):
+        build, folder = TRAININGS[name], tmp_path_factory.mktemp("training")
+        seed_everything(0)
+        build(folder / "uninterrupted").train()
+        seed_everything(0)
+        trainer = build(folder / "run")
+        for each, cut in CUTS.items():
+            cut.arm(trainer)
+            with pytest.raises(Interrupted):
+                trainer.train()
+            cut.holds(trainer)
+            shutil.copytree(folder / "run", folder / each)
+        trainer.train()
+        return build, folder
+
+    return prepare
+
+
+@pytest.fixture
+def training(request, prepare):
+    """How to build a training, and folders: "uninterrupted", "run" (stopped at every cut), one as each cut left it."""
+    return prepare(request.param)
+
+
+def resume(build, folder, **settings):
+    """A new training, with nothing in common with the stopped one, that goes on from its newest checkpoint."""
+    seed_everything(99)
+    trainer = build(folder, seed=99, **settings)
+    trainer.resume(trainer.checkpoints.newest())
+    return trainer
+
+
+@pytest.mark.parametrize(("training", "name"), PAIRS, indirect=["training"])
+def test_a_stopped_training_goes_on_as_if_nothing_had_happened(training, name, tmp_path):
+    build, folder = training
+    shutil.copytree(folder / name, tmp_path, dirs_exist_ok=True)
+    trainer = resume(build, tmp_path)
+    Checkpoints(tmp_path / "again" / "checkpoints").save(trainer._components(), step=trainer.frames)
+    check_same_checkpoint(tmp_path / "again", folder / name)  # everything that was saved was restored
+    trainer.train()
+    check_same(tmp_path, folder / "uninterrupted")
+
+
+only_v2 = pytest.mark.parametrize("training", ["v2"], indirect=True)
+
+
+@only_v2
+def test_one_that_goes_on_in_the_same_process(training):
+    _, folder = training
+    check_same(folder / "run", folder / "uninterrupted")
+
+
+@only_v2
+def test_one_that_is_stopped_again_and_again(training, tmp_path):
+    build, folder = training
+    shutil.copytree(folder / "in the first evaluation", tmp_path, dirs_exist_ok=True)
+    for name in ("between two updates", "between two updates of the other level", "with full memories"):
+        trainer = resume(build, tmp_path)
+        CUTS[name].arm(trainer)
+        with pytest.raises(Interrupted):
+            trainer.train()
+    resume(build, tmp_path).train()
+    check_same(tmp_path, folder / "uninterrupted")
+
+
+@only_v2
+def test_one_that_crashed_does_again_what_came_after_its_checkpoint(training, tmp_path):
+    def crash():
+        raise RuntimeError("crash")
+
+    build, folder = training
+    shutil.copytree(folder / "between two updates", tmp_path, dirs_exist_ok=True)
+    trainer = resume(build, tmp_path, checkpoint_frames=160)
+    CUTS["in the last batch"].arm(trainer, crash)
+    with pytest.raises(RuntimeError, match="crash"):
+        trainer.train()
+    assert [row["frames"] for row in table(tmp_path)] == ["0", "96", "128", "192"]
+    trainer = resume(build, tmp_path)
+    assert trainer.frames == 160 and [row["frames"] for row in table(tmp_path)] == ["0", "96", "128"]
+    trainer.train()
+    check_same(tmp_path, folder / "uninterrupted")
+
+
+@pytest.mark.parametrize("training", ["drqn", "v2"], indirect=True)
+def test_one_that_had_ended_goes_on_when_total_frames_are_raised(training, tmp_path):
+    build, folder = training
+    shutil.copytree(folder / "between two updates", tmp_path, dirs_exist_ok=True)
+    resume(build, tmp_path, total_frames=128).train()
+    trainer = resume(build, tmp_path)
+    at(trainer, batch=4, rows=3, updates_each=[8])
+    trainer.train()
+    check_same(tmp_path, folder / "uninterrupted")
+
+
+@only_v2
+def test_one_that_had_ended_stays_as_it_is(training, tmp_path):
+    build, folder = training
+    shutil.copytree(folder / "uninterrupted", tmp_path, dirs_exist_ok=True)
+    resume(build, tmp_path).train()
+    check_same(tmp_path, folder / "uninterrupted")
