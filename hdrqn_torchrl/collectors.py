@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
 
 
 class ResumableCollector(Collector):
@@ -23,9 +24,10 @@ class ResumableCollector(Collector):
         >>> collector = ResumableCollector(MultiGoalGridEnv(num_envs=2), frames_per_batch=8, total_frames=64)
         >>> batches = iter(collector)
         >>> _ = next(batches)
-        >>> state, following = collector.state_dict(), next(batches)["observation"].clone()
+        >>> state = collector.state_dict()
+        >>> _ = next(batches)
         >>> collector.load_state_dict(state)
-        >>> collector.env.base_env.steps.tolist()
+        >>> collector.env.steps.tolist()
         [4, 4]
     """
 
@@ -45,6 +47,8 @@ class ResumableCollector(Collector):
         """TorchRL's state without the policy, which has a checkpoint entry of its own, and with what it lacks."""
         state = super().state_dict()
         state.pop("policy_state_dict", None)
+        if not isinstance(self.env, TransformedEnv):
+            state["env_state_dict"] = self.env.state_dict()
         return {**state, "base_env": self._base_env.state_dict(), "carrier": self._carrier.exclude("next").clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs) -> None:

@@ -119,11 +119,12 @@ def make_training(
     env = small_env(4, seed=seed)
     levels = ("exploration",) if name in ("dqn", "drqn") else ("sub_exploration", "meta_exploration")
     parts: dict = {level: EpsilonGreedy(1.0, 0.1, anneal_frames=300) for level in levels}
+    quick = {"capacity": 40, "frames_per_update": 8, "warmup_frames": 64, "learning_rate": 1e-2}
     if name == "v3":
         parts["sub_exploration"] = RepeatingEpsilonGreedy(1.0, 0.1, anneal_frames=300)
+        quick["slice_len"] = 2  # so that the ten steps of an environment always hold the start of a sequence
     if len(levels) > 1:
         parts["max_option_steps"] = 3  # several options an episode
-    quick = {"capacity": 40, "frames_per_update": 8, "warmup_frames": 64, "learning_rate": 1e-2}
     algorithm = build(name, env, settings=tiny_settings(**(quick | (learner or {}))), **parts, **(options or {}))
     evaluation_env = algorithm.transform(small_env(8))
     defaults = {"total_frames": 256, "log_frames": 96, "evaluation_frames": 128, "checkpoint_frames": 1_000_000}

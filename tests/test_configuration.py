@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
 from omegaconf import MISSING, OmegaConf
 
 import configuration
@@ -19,6 +21,7 @@ from configuration import (
     check,
     check_targets,
     command_line,
+    explain,
     load_agent,
     pick_device,
     read_choices,
@@ -127,6 +130,32 @@ class TestCheckTargets:
         check_targets(settings, ["my_package.MyEnv"])
         settings.allowed_targets = ["my_package.MyEnv"]
         check(settings)
+
+
+@pytest.mark.parametrize(
+    ("section", "told"),
+    [
+        (
+            {"_target_": "hdrqn_torchrl.envs.MultiGoalGridEnv", "view": 4},
+            r"env\.view must be an odd number .* got 4; .*",
+        ),
+        (
+            {"_target_": "hdrqn_torchrl.envs.MultiGoalGridEnv", "veiw": 4},
+            r"env: .*'veiw'; `python train\.py --cfg job` .*",
+        ),
+        ({"_target_": "os.makedirs", "name": "FILE/folder"}, r"\[Errno \d+\] Not a directory: .*"),  # no wrong setting
+    ],
+    ids=["value", "name", "disk"],
+)
+def test_explain(settings, tmp_path, section, told):
+    (tmp_path / "FILE").write_text("")
+    settings.env = {key: str(value).replace("FILE", str(tmp_path / "FILE")) for key, value in section.items()}
+    if "view" in section:
+        settings.env.view = 4
+    with pytest.raises(InstantiationException) as error:
+        instantiate(settings.env)
+    assert re.fullmatch(told, explain(error.value))
+    assert explain(ValueError("seed must be an integer.")) == "seed must be an integer."
 
 
 @pytest.fixture(scope="module")

@@ -56,9 +56,10 @@ class Campaign:
         while not any(note["event"] == "done" for note in diary.read()):
             before = diary.read()
             process = start(train_with_diary, folder, name, seed, settings)
-            killed = self.kill_some_time(process, folder, diary, len(before))
+            self.kill_some_time(process, folder, diary, len(before))
             process.join(60)
-            assert process.exitcode == (-signal.SIGKILL if killed else 0), (folder / "error.txt").read_text()
+            killed = process.exitcode == -signal.SIGKILL
+            assert killed or process.exitcode == 0, (folder / "error.txt").read_text()
             self.judge(diary.read(), len(before), killed_at)
             killed_at = time.monotonic() if killed else None
             self.in_write = any((folder / "checkpoints").glob(".*"))
@@ -67,8 +68,8 @@ class Campaign:
         make_training(reference, name, seed=seed, **settings).train()
         check_same(folder, reference)
 
-    def kill_some_time(self, process, folder: Path, diary: Diary, known: int) -> bool:
-        """Whether it was killed; otherwise it was done before."""
+    def kill_some_time(self, process, folder: Path, diary: Diary, known: int) -> None:
+        """Kills a process, unless it is done before."""
         count, in_write = self.random.randint(1, 2), self.random.random() < 0.5
         events, size = [], 0
         while process.is_alive():
@@ -80,10 +81,9 @@ class Campaign:
             else:
                 now = events.count("batch") == count
             if "start" in events and now:
-                time.sleep(self.random.uniform(0.0, 0.1))
-                os.kill(process.pid, signal.SIGKILL)
-                return True
-        return False
+                time.sleep(self.random.uniform(0.0, 0.01 if in_write else 0.1))
+                process.kill()
+                return
 
     def judge(self, notes: list[dict], known: int, killed_at: float | None) -> None:
         """Where the last start went on, compared with where the process before it was killed."""

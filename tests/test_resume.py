@@ -23,7 +23,7 @@ TRAININGS = {
     ),
     "v2": partial(make_training, name="v2"),
     "v2-refreshed": partial(make_training, name="v2", options={"refresh_hidden_steps": 7}),
-    "v3": partial(make_training, name="v3", learner={"slice_len": 2}),
+    "v3": partial(make_training, name="v3"),
 }
 
 

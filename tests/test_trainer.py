@@ -331,6 +331,38 @@ class TestStopRequests:
         assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == former
 
 
+def test_its_clocks_stand_still_while_it_is_stopped(tmp_path, monkeypatch):
+    clock = [5.0]
+    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
+
+    def take_a_second():
+        clock[0] += 1.0
+
+    def make(at):
+        at = dict.fromkeys(range(1, 20), take_a_second) | at
+        return make_trainer(
+            collector=FakeCollector(at),
+            total_frames=100,
+            log_frames=50,
+            evaluation_frames=1_000,
+            checkpoints=Checkpoints(tmp_path),
+        )
+
+    first = make({4: lambda: take_a_second() or signal.raise_signal(signal.SIGTERM)})
+    with pytest.raises(Interrupted):
+        first.train()
+    clock[0] += 1_000
+    second = make({})
+    second.resume(second.checkpoints.newest())
+    assert second.wall_seconds == 4.0
+    second.train()
+    rows = second.logger.rows
+    assert [(row["frames"], row["wall_seconds"], row["frames_per_second"]) for row in rows] == [
+        (50, 5.0, 10.0),
+        (100, 10.0, 10.0),
+    ]
+
+
 class TestCheckFinite:
     @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
     @pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward"), ("sub_hidden")])
