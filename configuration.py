@@ -1,6 +1,6 @@
 """From settings to built objects: rules for every setting, the allow-list of what may be built, runs read back.
 
-Beside the entry points this is the only file that knows hydra and omegaconf.
+Beside the entry points only this file, resuming.py and sweeps.py know hydra and omegaconf.
 """
 
 from __future__ import annotations
@@ -254,11 +254,11 @@ def load_agent(
 
     folder = Path(run)
     config = read_config(folder)
-    check_targets(config, allowed_targets or [])
     for key, value in (env_changes or {}).items():
         if key.startswith("_") or key not in config.env:
             raise SettingsError(f"env.{key} must be one of {sorted(set(config.env) - {'_target_'})}; it is none.")
         config.env[key] = value
+    check_targets(config, allowed_targets or [])
     try:
         env, algorithm = build_algorithm(config, num_envs=num_envs, device="cpu")
         load_policy(algorithm.policy, folder / "checkpoints", checkpoint)
