@@ -202,7 +202,9 @@ def read_config(folder: Path) -> DictConfig:
         stored = OmegaConf.load(path)
         config = OmegaConf.merge(OmegaConf.structured(Schema), stored)
         OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        if not all(isinstance(config[part], DictConfig) for part in ("env", "algo", "network", "logger")):
+        if not all(
+            isinstance(OmegaConf.select(config, part), DictConfig) for part in ("env", "algo", "network", "logger")
+        ):
             raise TypeError("env, algo, network and logger must have settings below them")
     except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AssertionError, RecursionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]

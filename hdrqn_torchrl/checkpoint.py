@@ -45,6 +45,7 @@ class SafetensorsAdapter(CheckpointAdapter):
         structure = _encode(component.state_dict(), tensors, "")
         save_file(_without_aliases(tensors), path / TENSORS)
         (path / STRUCTURE).write_text(json.dumps(structure))
+        (path / TENSORS).chmod((path / STRUCTURE).stat().st_mode)  # safetensors lets nobody else read its files
 
     def load(
         self,

@@ -285,6 +285,17 @@ class TestRetention:
         checkpoints.go_back_to(10)
         assert self.save(checkpoints, 15) == [10, 15]
 
+    def test_and_damaged_ones_but_nothing_else(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path, keep_last=3)
+        self.save(checkpoints, 10, 20)
+        (tmp_path / "checkpoint-000000000010" / "manifest.json").unlink()
+        names = ["checkpoint-000000000030-mine", "checkpoint-", "checkpoints", "notes"]
+        for name in names:
+            make_folder(tmp_path / name)
+        with pytest.warns(UserWarning, match="is not complete: manifest"):
+            checkpoints.go_back_to(20)
+        assert {path.name for path in tmp_path.iterdir()} == {"checkpoint-000000000020", *names}
+
 
 def make_folder(path, files=("manifest.json",)):
     path.mkdir(parents=True)
@@ -597,3 +608,8 @@ class TestLoadPolicy:
         Checkpoints(tmp_path).save({"policy": nn.Linear(2, 2)}, step=1)
         with pytest.raises(ValueError, match=r"checkpoint can't be loaded: .* does not fit; "):
             load_policy(nn.Linear(3, 2), tmp_path)
+
+
+def test_whoever_may_read_the_rest_of_a_checkpoint_may_read_its_tensors(tmp_path):
+    path = Checkpoints(tmp_path).save({"module": nn.Linear(2, 1)}, step=1)
+    assert len({file.stat().st_mode for file in path.rglob("*") if file.is_file()}) == 1

@@ -405,6 +405,14 @@ class TestFailures:
         assert not (tmp_path / "run" / "error.txt").exists()
         assert stop(process, signal.SIGINT) == 130
 
+    def test_a_run_that_was_killed_before_its_first_checkpoint_starts_again(self, a_run, finished):
+        shutil.rmtree(a_run / "checkpoints")
+        (a_run / "metrics.partial").write_text("half")
+        code, _, told = run_script(a_run.parent, "resume=run")
+        assert code == 0, told
+        assert table(a_run) == table(finished / "run") and not (a_run / "metrics.partial").exists()
+        check_same_checkpoint(a_run, finished / "run")
+
     def test_a_damaged_newest_checkpoint_costs_one_interval(self, a_run, finished):
         newest = a_run / "checkpoints" / "checkpoint-000000001024"
         (newest / "components" / "0004-policy" / "tensors.safetensors").write_bytes(b"half")
