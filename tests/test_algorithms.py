@@ -3,7 +3,7 @@ from copy import deepcopy
 import pytest
 import torch
 from helpers import ALGORITHMS, build, collect, make_collector, parameter_distance, small_env, tiny_settings
-from torchrl.envs.utils import check_env_specs
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -401,3 +401,31 @@ class TestV3:
                 learner.update(learner.sample())
         assert parameter_distance(first.loss.policy_params.data, second.loss.policy_params.data) == 0
         assert parameter_distance(first.loss.target_policy_params, second.loss.target_policy_params) == 0
+
+
+class TestRepeatedActions:
+    """Temporally extended epsilon-greedy is not v3's alone."""
+
+    @pytest.mark.parametrize("name", ["drqn", "dqn", "v1", "v2", "hdqn"])
+    def test_random_stretches_last_over_steps_but_not_over_episodes(self, name):
+        torch.manual_seed(0)
+        env = small_env(32, max_steps=20, num_goals=2)
+        always = RepeatingEpsilonGreedy(1.0, 1.0, exponent=0.01, max_repeats=10)
+        place = "exploration" if name in ("drqn", "dqn") else "sub_exploration"
+        algorithm = build(name, env, **{place: always})
+        steps = collect(algorithm, env, 60)[0]
+        left, action = steps["repeated_action"][..., 1], steps["action"]
+        assert not left[steps["is_init"].squeeze(-1)].any()
+        goes_on = left[:, 1:] > 0
+        assert goes_on.float().mean() > 0.6
+        assert (action[:, 1:] == action[:, :-1])[goes_on].all()
+        for learner in algorithm.learners.values():
+            learner.store(steps)
+        assert torch.isfinite(learner.update(learner.sample())["loss"])
+
+    def test_a_greedy_policy_does_not_repeat(self):
+        env = small_env(4)
+        algorithm = build("v2", env, sub_exploration=RepeatingEpsilonGreedy(1.0, 1.0))
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            steps = algorithm.transform(env).rollout(6, algorithm.policy, break_when_any_done=False)
+        assert not steps["repeated_action"].any()

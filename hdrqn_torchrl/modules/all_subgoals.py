@@ -16,7 +16,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
 from hdrqn_torchrl.modules.q_network import State, dueling
@@ -215,18 +215,12 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         starts = tensordict.get(self.option_init_key).squeeze(-1)
         chosen = self.meta_exploration(subgoal_value, mask)
         subgoal = torch.where(starts, chosen, tensordict.get(self.active_subgoal_key))
-        action = self._choose_action(tensordict, values_of(action_value, subgoal))
+        wanted = values_of(action_value, subgoal)
+        action = choose_action(self.sub_exploration, wanted, tensordict, self.repeated_action_key)
         tensordict.set(self.subgoal_key, subgoal).set(self.action_key, action)
         for key, value in ((self.hidden_key, hidden), (self.cell_key, cell), (self.previous_action_key, action)):
             tensordict.set(_next(key), value)
         return tensordict
-
-    def _choose_action(self, tensordict: TensorDictBase, action_value: Tensor) -> Tensor:
-        if not isinstance(self.sub_exploration, RepeatingEpsilonGreedy):
-            return self.sub_exploration(action_value)
-        action, carried = self.sub_exploration.extend(action_value, tensordict.get(self.repeated_action_key))
-        tensordict.set(_next(self.repeated_action_key), carried)
-        return action
 
 
 def values_of(action_value: Tensor, subgoal: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.modules.exploration import EpsilonGreedy
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
 from hdrqn_torchrl.modules.q_network import QNetwork, State
 
 
@@ -36,6 +36,8 @@ class SubController(TensorDictModuleBase):
         subgoal_key: the subgoal in force, or ``None`` for a flat agent.
         init_key: where the state restarts.
         hidden_key, cell_key: LSTM state ``[H]``.
+        repeated_action_key: random stretch in progress ``[2]``, for a
+            :class:`~hdrqn_torchrl.modules.RepeatingEpsilonGreedy`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -61,6 +63,7 @@ class SubController(TensorDictModuleBase):
         action_value_key: NestedKey = keys.ACTION_VALUE,
         hidden_key: NestedKey = keys.SUB_HIDDEN,
         cell_key: NestedKey = keys.SUB_CELL,
+        repeated_action_key: NestedKey = keys.REPEATED_ACTION,
     ) -> None:
         super().__init__()
         if (subgoal_key is None) != (network.num_conditions == 0):
@@ -71,16 +74,18 @@ class SubController(TensorDictModuleBase):
         self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
-        self.hidden_key, self.cell_key = hidden_key, cell_key
+        self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
+        self.repeats = isinstance(self.exploration, RepeatingEpsilonGreedy)
         self.in_keys = [observation_key, *([] if subgoal_key is None else [subgoal_key]), init_key]
-        self.out_keys = [action_key]
-        if network.recurrent:
-            self.in_keys += [hidden_key, cell_key]
-            self.out_keys += [_next(hidden_key), _next(cell_key)]
+        carried = [hidden_key, cell_key] if network.recurrent else []
+        carried += [repeated_action_key] if self.repeats else []
+        self.in_keys += carried
+        self.out_keys = [action_key, *(_next(key) for key in carried)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
-        return _primer(self.network, self.hidden_key, self.cell_key)
+        stretch = {self.repeated_action_key: Unbounded(shape=(2,), dtype=torch.int64)} if self.repeats else {}
+        return _primer(self.network, self.hidden_key, self.cell_key, stretch)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict.get(self.observation_key)
@@ -89,13 +94,18 @@ class SubController(TensorDictModuleBase):
         if recurrent_mode():
             return tensordict.set(self.action_value_key, self.network.unroll(observation, subgoal, init.squeeze(-1)))
         if not self.network.recurrent:
-            return tensordict.set(self.action_key, self.exploration(self.network.evaluate(observation, subgoal)))
+            return tensordict.set(
+                self.action_key, self._choose(self.network.evaluate(observation, subgoal), tensordict)
+            )
         hidden = tensordict.get(self.hidden_key).masked_fill(init, 0.0)
         cell = tensordict.get(self.cell_key).masked_fill(init, 0.0)
         value, (hidden, cell) = self.network.step(observation, subgoal, (hidden, cell))
-        tensordict.set(self.action_key, self.exploration(value))
+        tensordict.set(self.action_key, self._choose(value, tensordict))
         tensordict.set(_next(self.hidden_key), hidden)
         return tensordict.set(_next(self.cell_key), cell)
+
+    def _choose(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
+        return choose_action(self.exploration, value, tensordict, self.repeated_action_key)
 
     def advance(self, tensordict: TensorDictBase, subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL) -> State:
         """LSTM state after one more observation, without a decision.
@@ -237,6 +247,8 @@ def _next(key: NestedKey) -> tuple[str, ...]:
     return ("next", *((key,) if isinstance(key, str) else key))
 
 
-def _primer(network: QNetwork, hidden_key: NestedKey, cell_key: NestedKey) -> TensorDictPrimer:
+def _primer(
+    network: QNetwork, hidden_key: NestedKey, cell_key: NestedKey, others: dict[NestedKey, Unbounded] | None = None
+) -> TensorDictPrimer:
     state = Unbounded(shape=(network.hidden_size,))
-    return TensorDictPrimer({hidden_key: state, cell_key: state.clone()}, expand_specs=True)
+    return TensorDictPrimer({hidden_key: state, cell_key: state.clone(), **(others or {})}, expand_specs=True)

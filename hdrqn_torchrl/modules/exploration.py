@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
@@ -145,6 +147,27 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         left = torch.where(begins, durations, left)
         choice = torch.where(left > 0, action, greedy)
         return choice, torch.stack([action, (left - 1).clamp(min=0)], -1)
+
+
+def choose_action(
+    exploration: EpsilonGreedy, action_value: Tensor, tensordict: TensorDictBase, repeated_action_key: NestedKey
+) -> Tensor:
+    """The choice of a policy in ``tensordict``, which carries the random stretch in progress, if there can be one.
+
+    Args:
+        exploration: how to choose.
+        action_value: Q-values ``[*, A]``.
+        tensordict: a :class:`RepeatingEpsilonGreedy` reads ``repeated_action_key`` and writes it under ``"next"``.
+        repeated_action_key: ``[*, 2]`` int64.
+
+    Returns:
+        ``[*]`` int64.
+    """
+    if not isinstance(exploration, RepeatingEpsilonGreedy):
+        return exploration(action_value)
+    action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key))
+    tensordict.set(unravel_key(("next", repeated_action_key)), carried)
+    return action
 
 
 def _random_choice(action_value: Tensor, mask: Tensor | None) -> Tensor:
