@@ -60,6 +60,8 @@ def plan(config: DictConfig, folder: Path) -> Plan:
         config = with_overrides(read_config(run), read_choices(run), config, HydraConfig.get().overrides.task)
         check(config)
     refuse_differences(run, config)
+    if checkpoint is not None and not config.resume_override:
+        refuse_going_back(checkpoint)
     if run.resolve() != folder.resolve():
         with contextlib.suppress(OSError):  # Hydra made it for this process; it is empty
             folder.rmdir()
@@ -129,6 +131,15 @@ def refuse_differences(run: Path, config: DictConfig) -> None:
         raise SettingsError(
             f"settings must be those of the run that is resumed, and differ from {run}:\n  {lines}\n"
             "Leave them out, or take the new ones with resume_override=true."
+        )
+
+
+def refuse_going_back(checkpoint: Path) -> None:
+    """Ends the program if a run was saved later than ``checkpoint``: going on from there would undo that."""
+    if later := sorted(path.name for path in checkpoint.parent.glob("checkpoint-*") if path.name > checkpoint.name):
+        raise SettingsError(
+            f"resume must name a run's newest checkpoint, got {checkpoint}; {', '.join(later)} and the rows logged since "
+            "would be removed. Copy the run folder and resume the copy, or allow it with resume_override=true."
         )
 
 

@@ -320,7 +320,9 @@ class TestGoingOnWithAFinishedRun:
         check_run_folder(a_run, frames=1_024)
 
     def test_from_an_older_checkpoint(self, a_run, finished):
-        code, _, told = run_script(a_run.parent, "resume=run/checkpoints/checkpoint-000000000512")
+        code, _, told = run_script(
+            a_run.parent, "resume=run/checkpoints/checkpoint-000000000512", "resume_override=true"
+        )
         assert code == 0, told
         assert table(a_run) == table(finished / "run")
         check_same_checkpoint(a_run, finished / "run")
@@ -338,6 +340,12 @@ class TestWhatIsLeftAlone:
         before = snapshot(a_run)
         told = self.refused(a_run.parent, *SHORT, "hydra.run.dir=run")
         assert told[-1].startswith("error: ") and "already holds a run, which would be overwritten" in told[-1]
+        assert snapshot(a_run) == before
+
+    def test_what_was_saved_after_the_checkpoint_it_shall_go_on_from(self, a_run):
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run/checkpoints/checkpoint-000000000512")
+        assert "must name a run's newest checkpoint" in told[-1] and "resume_override=true" in told[-1]
         assert snapshot(a_run) == before
 
     def test_other_settings(self, a_run):
