@@ -39,18 +39,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from configuration import SettingsError, command_line, read_choices
 from hdrqn_torchrl.comparison import FINALS, GREEDY, PAPER, Panel, plot_bars, plot_curves
+from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
 from hdrqn_torchrl.grouping import Entry, Row, differences, rows_of, task_key, task_of, value_of
-from hdrqn_torchrl.results import (
-    Group,
-    References,
-    TaskResults,
-    curve,
-    estimate_curves,
-    estimate_finals,
-    find_runs,
-    read_run,
-    write_table,
-)
+from hdrqn_torchrl.results import References, curve, find_runs, read_run
 
 ALLOWED = {
     "kind": ("curves", "greedy", "bars"),

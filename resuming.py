@@ -138,8 +138,8 @@ def refuse_going_back(checkpoint: Path) -> None:
     """Ends the program if a run was saved later than ``checkpoint``: going on from there would undo that."""
     if later := sorted(path.name for path in checkpoint.parent.glob("checkpoint-*") if path.name > checkpoint.name):
         raise SettingsError(
-            f"resume must name a run's newest checkpoint, got {checkpoint}; {', '.join(later)} and the rows logged since "
-            "would be removed. Copy the run folder and resume the copy, or allow it with resume_override=true."
+            f"resume must name a run's newest checkpoint, got {checkpoint}; {', '.join(later)} and the rows logged "
+            "since would be removed. Copy the run folder and resume the copy, or allow it with resume_override=true."
         )
 
 

@@ -1,9 +1,9 @@
 """Checkpoints of a whole training, on ``torchrl.checkpoint``: durable, verified, and unable to run code.
 
 TorchRL's ``Checkpoint`` writes a folder beside its destination and renames it, and its ``CheckpointRotation`` keeps
-the last and the best. Added here: tensors in safetensors and everything else in JSON, so that no file is ever
-unpickled; every byte on the disk (fsync) before a checkpoint gets its name; a checksum of every file, checked
-before anything is loaded; removal of what killed writes left behind.
+the last and the best. Added here: files that need no pickle (``serialization.py``); every byte on the disk (fsync)
+before a checkpoint gets its name; a checksum of every file, checked before anything is loaded; removal of what killed
+writes left behind.
 """
 
 from __future__ import annotations
@@ -21,45 +21,14 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from tensordict import TensorDict, TensorDictBase
-from torch import Tensor, nn
-from torchrl.checkpoint import Checkpoint, CheckpointAdapter, CheckpointError, CheckpointRotation
+from torch import nn
+from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
-TENSORS, STRUCTURE, CHECKSUMS = "tensors.safetensors", "structure.json", "checksums.json"
+from hdrqn_torchrl.serialization import SafetensorsAdapter
+
+CHECKSUMS = "checksums.json"
 PREFIX, SCORE = "checkpoint-", "greedy_return"
 _UNSCORED = -sys.float_info.max  # the rotation wants a finite number; this one is never the best
-
-
-class SafetensorsAdapter(CheckpointAdapter):
-    """Writes a component's ``state_dict`` as one safetensors file and one JSON file.
-
-    TorchRL's own adapter falls back to ``torch.load`` when it meets a pickle; this one has nothing to fall back to.
-    A state may nest dicts, lists, tuples, tensors, TensorDicts, numbers, strings and ``None``.
-    """
-
-    adapter_id = "hdrqn_torchrl.safetensors"
-
-    def save(self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
-        path.mkdir(parents=True, exist_ok=True)
-        tensors: dict[str, Tensor] = {}
-        structure = _encode(component.state_dict(), tensors, "")
-        save_file(_without_aliases(tensors), path / TENSORS)
-        (path / STRUCTURE).write_text(json.dumps(structure))
-        (path / TENSORS).chmod((path / STRUCTURE).stat().st_mode)  # safetensors lets nobody else read its files
-
-    def load(
-        self,
-        component: Any,
-        path: Path,
-        *,
-        map_location: Any,
-        tensor_load_kwargs: Mapping[str, Any],
-        args: tuple[Any, ...],
-        kwargs: Mapping[str, Any],
-    ) -> None:
-        device = torch.device(map_location or "cpu")
-        structure = json.loads((path / STRUCTURE).read_text())
-        component.load_state_dict(_decode(structure, load_file(path / TENSORS), device))
 
 
 class DurableCheckpoint(Checkpoint):
@@ -301,62 +270,6 @@ def load_weights(module: nn.Module, path: Path) -> None:
         module.load_state_dict(weights)
     except RuntimeError as error:
         raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
-
-
-def _encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
-    """``value`` as JSON; its tensors go to ``tensors``, by the path that leads to them."""
-
-    def inner(key: Any, item: Any) -> Any:
-        return _encode(item, tensors, f"{name}/{key}" if name else str(key))
-
-    if isinstance(value, Tensor):
-        assert name not in tensors, name
-        tensors[name] = value.detach()
-        return {"tensor": name}
-    if isinstance(value, TensorDictBase):
-        items = {key: inner(key, item) for key, item in value.items()}
-        return {"tensordict": items, "batch_size": list(value.batch_size), "names": list(value.names)}
-    if isinstance(value, Mapping):
-        return {"dict": [[key, inner(key, item)] for key, item in value.items()]}
-    for kind, type_ in (("size", torch.Size), ("tuple", tuple), ("list", list)):
-        if isinstance(value, type_):
-            return {kind: [inner(index, item) for index, item in enumerate(value)]}
-    if isinstance(value, torch.device):
-        return {"device": str(value)}
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    raise TypeError(f"a state may hold tensors, numbers, strings and containers of them, got {type(value)} at {name}.")
-
-
-def _decode(value: Any, tensors: Mapping[str, Tensor], device: torch.device) -> Any:
-    """The inverse of :func:`_encode`."""
-    if not isinstance(value, dict):
-        return value
-    kind = next(iter(value))
-    content = value[kind]
-    if kind == "tensor":
-        return tensors[content].to(device, copy=True)  # a copy, as the original is mapped from the file
-    if kind == "tensordict":
-        items = {key: _decode(item, tensors, device) for key, item in content.items()}
-        names = value["names"] if any(value["names"]) else None
-        return TensorDict(items, batch_size=value["batch_size"], device=device, names=names)
-    if kind == "dict":
-        return {key: _decode(item, tensors, device) for key, item in content}
-    if kind == "device":
-        return device
-    return {"size": torch.Size, "tuple": tuple, "list": list}[kind](_decode(item, tensors, device) for item in content)
-
-
-def _without_aliases(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Copies tensors that share memory with others, which safetensors refuses; the rest is written from its place."""
-    seen: set[int] = set()
-    unshared = {}
-    for name, tensor in tensors.items():
-        tensor = tensor.cpu().contiguous()
-        memory = tensor.untyped_storage().data_ptr()
-        unshared[name] = tensor.clone() if memory in seen else tensor
-        seen.add(memory)
-    return unshared
 
 
 def _checksum(path: Path) -> list[int]:

@@ -16,7 +16,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter, MaxNLocator, PercentFormatter
 from numpy.typing import NDArray
 
-from hdrqn_torchrl.results import Array, Center, Estimate, Group, TaskResults
+from hdrqn_torchrl.estimates import Center, Estimate, Group, TaskResults
+from hdrqn_torchrl.results import Array
 
 
 class Panel(NamedTuple):
@@ -130,7 +131,7 @@ def plot_bars(
     """Draws final results of groups of runs as bars with intervals; each run is a dot, hollow if it is unfinished.
 
     Args:
-        tasks: results at one position (:func:`~hdrqn_torchrl.results.estimate_finals`), one row of panels each.
+        tasks: results at one position (:func:`~hdrqn_torchrl.estimates.estimate_finals`), one row of panels each.
         paths: pictures to write; their endings choose the format.
         panels: what to draw; panels that no group has data for are left out.
         center: what the estimates are, for the caption.

@@ -224,3 +224,16 @@ def parameter_distance(first: TensorDictBase, second: TensorDictBase) -> float:
     first, second = (dict(params.items(True, True)) for params in (first, second))
     assert first.keys() == second.keys()
     return max((first[key] - second[key]).abs().max().item() for key in first if first[key].numel())
+
+
+class State:
+    """A component that is nothing but its state."""
+
+    def __init__(self, state=None):
+        self.state = state
+
+    def state_dict(self):
+        return self.state
+
+    def load_state_dict(self, state):
+        self.state = state

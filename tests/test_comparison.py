@@ -10,7 +10,8 @@ from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 
 from hdrqn_torchrl.comparison import GREEDY, PAPER, Panel, plot_bars, plot_curves
-from hdrqn_torchrl.results import Estimate, Group, Run, TaskResults, estimate_curves, estimate_finals
+from hdrqn_torchrl.estimates import Estimate, Group, TaskResults, estimate_curves, estimate_finals
+from hdrqn_torchrl.results import Run
 
 COLUMNS = [name for panel in (*PAPER, *GREEDY) for name in panel if name]
 MEMORY = {"memory": {"return_mean": 2.0, "success_rate": 1.0, "steps_mean": 15.5}}

@@ -9,8 +9,8 @@ import hdrqn_torchrl
 
 ORDER = (
     "keys", "envs", "transforms", "modules", "objectives", "data", "collectors", "learner", "algorithms", "evaluation",
-    "checkpoint", "interruption", "logging", "results", "grouping", "plotting", "rendering", "comparison", "trainer",
-    "run_folder",
+    "serialization", "checkpoint", "interruption", "logging", "results", "estimates", "grouping", "plotting",
+    "rendering", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
