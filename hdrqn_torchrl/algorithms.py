@@ -27,8 +27,10 @@ from hdrqn_torchrl.modules import (
     EpsilonGreedy,
     HierarchicalPolicy,
     MetaController,
+    ObservationPredictor,
     RepeatingEpsilonGreedy,
     SubController,
+    observation_decoder,
 )
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
 from hdrqn_torchrl.transforms import SubgoalTransform
@@ -275,6 +277,8 @@ def make_v3(
     hazard_reward: float = -1.0,
     max_option_steps: int | None = None,
     max_meta_target: float | None = None,
+    prediction_steps: int = 4,
+    prediction_weight: float = 0.1,
 ) -> Algorithm:
     """hDRQNv3, this project's own agent: one memory for the whole episode, all subgoals learn from every step.
 
@@ -287,8 +291,10 @@ def make_v3(
         head_size: units of the heads' hidden layers.
         joint: whether the meta level trains the memory, too.
         sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, wrong_subgoal_reward, hazard_reward,
-            max_meta_target: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+            max_meta_target, prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
         max_option_steps: step limit of an option.
+        prediction_steps: how many steps ahead, at most, the memory learns to predict what will be seen
+            (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
 
     Raises:
         ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty.
@@ -304,14 +310,25 @@ def make_v3(
             f"sampling must be 'episode_starts' for v3, got {learner.sampling!r}: its memory lasts a whole episode and "
             "would start empty in the middle of one."
         )
+    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
+    predictor = None
+    if prediction_steps:
+        predictor = ObservationPredictor(
+            observation_decoder(observation),
+            hidden_size=memory_size,
+            num_actions=num_actions,
+            max_steps=prediction_steps,
+            width=head_size,
+        )
     network = AllSubgoalsNetwork(
-        architecture.observation_features(env.observation_spec[keys.OBSERVATION]),
-        num_actions=env.action_spec.n,
+        architecture.observation_features(observation),
+        num_actions=num_actions,
         num_subgoals=num_subgoals,
         hidden_size=memory_size,
         head_size=head_size,
         joint=joint,
+        predictor=predictor,
     )
     sub_exploration, meta_exploration = sub_exploration or RepeatingEpsilonGreedy(), meta_exploration or EpsilonGreedy()
     policy = AllSubgoalsPolicy(network, sub_exploration, meta_exploration).to(env.device)
@@ -326,6 +343,7 @@ def make_v3(
         all_subgoals=all_subgoals,
         intra_option=intra_option,
         max_meta_target=max_meta_target,
+        prediction_weight=prediction_weight,
     )
     stored = StepSelector(
         root_keys=[

@@ -1,16 +1,18 @@
 """Networks, controllers and exploration as (TensorDict) modules."""
 
 from hdrqn_torchrl.modules.all_subgoals import AllSubgoalsNetwork, AllSubgoalsPolicy
-from hdrqn_torchrl.modules.architectures import Architecture, compact_network, paper_network
+from hdrqn_torchrl.modules.architectures import Architecture, compact_network, observation_decoder, paper_network
 from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
+from hdrqn_torchrl.modules.prediction import CellDecoder, ImageDecoder, ObservationPredictor
 from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
 
 __all__ = [
     "AllSubgoalsNetwork",
     "AllSubgoalsPolicy",
     "Architecture",
+    "CellDecoder",
     "CellFeatures",
     "CellsToImage",
     "ConvFeatures",
@@ -18,10 +20,13 @@ __all__ = [
     "EpsilonGreedy",
     "FullyConnectedFeatures",
     "HierarchicalPolicy",
+    "ImageDecoder",
     "MetaController",
+    "ObservationPredictor",
     "QNetwork",
     "RepeatingEpsilonGreedy",
     "SubController",
     "compact_network",
+    "observation_decoder",
     "paper_network",
 ]

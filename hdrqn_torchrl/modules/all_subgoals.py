@@ -19,6 +19,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
+from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.q_network import State, dueling
 
 
@@ -32,15 +33,16 @@ class AllSubgoalsNetwork(nn.Module):
         hidden_size: H, size of the LSTM.
         head_size: units of the hidden layer of each level's heads.
         joint: whether the meta level, too, trains the memory; ``False``: it only reads it.
+        predictor: a second task for the memory; not used in acting.
 
     Examples:
         >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
         >>> network = AllSubgoalsNetwork(FullyConnectedFeatures(6, (8,)), num_actions=4, num_subgoals=2, hidden_size=16)
         >>> observation, previous_action = torch.zeros(3, 5, 6), torch.zeros(3, 5, dtype=torch.int64)
         >>> init, mask = torch.zeros(3, 5, dtype=torch.bool), torch.ones(3, 5, 2, dtype=torch.bool)
-        >>> action_value, subgoal_value = network.unroll(observation, previous_action, init, mask)
-        >>> action_value.shape, subgoal_value.shape
-        (torch.Size([3, 5, 2, 4]), torch.Size([3, 5, 2]))
+        >>> action_value, subgoal_value, memory = network.unroll(observation, previous_action, init, mask)
+        >>> action_value.shape, subgoal_value.shape, memory.shape
+        (torch.Size([3, 5, 2, 4]), torch.Size([3, 5, 2]), torch.Size([3, 5, 16]))
     """
 
     _one_hot: Tensor
@@ -54,12 +56,14 @@ class AllSubgoalsNetwork(nn.Module):
         hidden_size: int = 128,
         head_size: int = 128,
         joint: bool = True,
+        predictor: ObservationPredictor | None = None,
     ) -> None:
         super().__init__()
         for name, value in (("hidden_size", hidden_size), ("head_size", head_size)):
             if value < 1:
                 raise ValueError(f"{name} must be >= 1, got {value}; use 128.")
         self.features, self.hidden_size, self.joint = features, hidden_size, joint
+        self.predictor = predictor
         self.num_actions, self.num_subgoals = num_actions, num_subgoals
         self.register_buffer("_one_hot", torch.eye(num_actions), persistent=False)
         self.memory = nn.LSTM(features.out_features + num_actions, hidden_size, batch_first=True)
@@ -116,7 +120,7 @@ class AllSubgoalsNetwork(nn.Module):
         init: Tensor,
         mask: Tensor,
         state: State | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Q-values along sequences.
 
         Args:
@@ -124,11 +128,12 @@ class AllSubgoalsNetwork(nn.Module):
             state: LSTM state before the first step, two tensors ``[B, H]``; zero if not given.
 
         Returns:
-            Q-values ``[B, T, G, A]`` and ``[B, T, G]``.
+            Q-values ``[B, T, G, A]`` and ``[B, T, G]``, and the memory's output ``[B, T, H]`` they were read from.
         """
         inputs = self._inputs(observation, previous_action, init)
         state = self.initial_state(len(inputs)) if state is None else state
-        return self._values(restarting_lstm(self.memory, inputs, init, state), mask)
+        memory = restarting_lstm(self.memory, inputs, init, state)
+        return *self._values(memory, mask), memory
 
 
 class AllSubgoalsPolicy(TensorDictModuleBase):
@@ -136,7 +141,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
 
     Acting takes one step: where an option starts the meta level chooses the subgoal, elsewhere it is kept; the action
     is chosen by the values of that subgoal. Learning (inside ``set_recurrent_mode(True)``) writes the values of all
-    steps, subgoals and actions.
+    steps, subgoals and actions, and the memory's output.
 
     Args:
         network: the network.
@@ -209,7 +214,11 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         init = init.squeeze(-1)
         if recurrent_mode():
             values = self.network.unroll(observation, previous_action, init, mask)
-            return tensordict.set(self.action_value_key, values[0]).set(self.subgoal_value_key, values[1])
+            for key, value in zip(
+                (self.action_value_key, self.subgoal_value_key, self.hidden_key), values, strict=True
+            ):
+                tensordict.set(key, value)
+            return tensordict
         state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
         action_value, subgoal_value, (hidden, cell) = self.network.step(observation, previous_action, init, mask, state)
         starts = tensordict.get(self.option_init_key).squeeze(-1)

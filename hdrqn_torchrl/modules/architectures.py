@@ -15,6 +15,7 @@ from hdrqn_torchrl.modules.features import (
     Features,
     FullyConnectedFeatures,
 )
+from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, DecoderFactory, ImageDecoder
 from hdrqn_torchrl.modules.q_network import QNetwork
 
 
@@ -98,3 +99,14 @@ def compact_network(
 def is_grid(spec: TensorSpec) -> bool:
     """Whether an observation spec is a window of cell codes (otherwise it is an image)."""
     return isinstance(spec, Categorical)
+
+
+def observation_decoder(spec: TensorSpec) -> DecoderFactory:
+    """Makes decoders for an observation spec: they guess cell codes, or a coarse image."""
+
+    def make(in_features: int) -> Decoder:
+        if is_grid(spec):
+            return CellDecoder(in_features, spec.shape[-1], spec.n)
+        return ImageDecoder(in_features, spec.shape[-3])
+
+    return make

@@ -13,6 +13,8 @@ belongs to every option that would have taken its action, and to the one pursued
 
 with :math:`U(g) = \max_{g'} Q^M(s', g')` where g was attained, else :math:`(1 - \lambda_t) Q^M(s', g) + \lambda_t
 y_{t+1}(g)`. So the meta level, too, learns from every step and not only from those at which options begin.
+
+Memory: if the network has a predictor, it is also trained to tell what the next few steps will show.
 """
 
 from __future__ import annotations
@@ -50,6 +52,8 @@ class AllSubgoalsLoss(LossModule):
         intra_option: ``False``: the meta level learns from the steps at which options begin only.
         max_meta_target: largest return of the task there can be, if known and never negative; the meta level's targets
             are kept between 0 and it.
+        prediction_weight: of the error of the network's predictor, if it has one; how many steps ahead it looks is
+            drawn anew for every minibatch.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -100,7 +104,10 @@ class AllSubgoalsLoss(LossModule):
         all_subgoals: bool = True,
         intra_option: bool = True,
         max_meta_target: float | None = None,
+        prediction_weight: float = 0.1,
     ) -> None:
+        if prediction_weight < 0.0:
+            raise ValueError(f"prediction_weight must be >= 0, got {prediction_weight}; use 0.1, or no predictor.")
         for name, value in (("sub_gamma", sub_gamma), ("meta_gamma", meta_gamma), ("trace_decay", trace_decay)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
@@ -114,6 +121,9 @@ class AllSubgoalsLoss(LossModule):
         self.reached_reward, self.wrong_subgoal_reward = reached_reward, wrong_subgoal_reward
         self.hazard_reward, self.double = hazard_reward, double
         self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
+        self.prediction_weight = prediction_weight
+        if self._predicts:
+            self.out_keys = [*self.out_keys, "prediction_loss"]
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -127,7 +137,7 @@ class AllSubgoalsLoss(LossModule):
         return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        online, target = self._values(tensordict)
+        online, target, memory = self._values(tensordict)
         steps = tensordict[:, :-1]
         events = self._events(steps)
         with torch.no_grad():
@@ -148,21 +158,42 @@ class AllSubgoalsLoss(LossModule):
                 "trained_steps": sub_steps.sum(),
             }
         losses = {"loss": sub_loss + meta_loss, "sub_loss": sub_loss.detach(), "meta_loss": meta_loss.detach()}
+        if self._predicts:
+            prediction_loss = self._prediction_loss(memory, tensordict)
+            losses["loss"] = losses["loss"] + self.prediction_weight * prediction_loss
+            losses["prediction_loss"] = prediction_loss.detach()
         return TensorDict({**losses, **report}, [])
 
-    def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
-        """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network."""
+    @property
+    def _predicts(self) -> bool:
+        return self._policies[0].network.predictor is not None and self.prediction_weight > 0.0
+
+    def _prediction_loss(self, memory: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Mean error over the steps whose next ``ahead`` steps are of the same episode."""
+        policy = self._policies[0]
+        predictor = policy.network.predictor
+        ahead = int(torch.randint(1, min(predictor.max_steps, tensordict.shape[1] - 1) + 1, ()))
+        observation, action = tensordict[policy.observation_key], tensordict[self.tensor_keys.action]
+        error = predictor(memory, action, observation, steps=ahead)
+        begins = tensordict[policy.init_key].squeeze(-1)[:, 1:]
+        return _masked_mean(error, ~begins.unfold(1, ahead, 1).any(-1))
+
+    def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Tensor]:
+        """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network; the main
+        network's memory ``[B, T + 1, H]``."""
         policy, target_policy = self._policies
         inputs = tensordict.select(policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
 
-        def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor]:
+        def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor, Tensor]:
             values = which(inputs.copy())
-            return values.get(which.action_value_key), values.get(which.subgoal_value_key)
+            written = (which.action_value_key, which.subgoal_value_key, which.hidden_key)
+            return tuple(values.get(key) for key in written)  # type: ignore[return-value]
 
         with set_recurrent_mode(True):
             with torch.no_grad():
-                target = run(target_policy)
-            return run(policy), target
+                target = run(target_policy)[:2]
+            *online, memory = run(policy)
+            return tuple(online), target, memory  # type: ignore[return-value]
 
     def _events(self, steps: TensorDictBase) -> dict[str, Tensor]:
         """What each step ``[B, T]`` led to, as far as it does not depend on values."""

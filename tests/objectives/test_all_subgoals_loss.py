@@ -48,6 +48,7 @@ class Tables(nn.Module):
     """A "network" whose values at a step are free parameters; the observation is the number of the step."""
 
     hidden_size = 1
+    predictor = None
 
     def __init__(self, steps, subgoals=G, actions=A):
         super().__init__()
@@ -55,7 +56,7 @@ class Tables(nn.Module):
         self.subgoal_value = nn.Parameter(torch.randn(steps, subgoals))
 
     def unroll(self, observation, previous_action, init, mask):
-        return self.action_value[observation], self.subgoal_value[observation]
+        return self.action_value[observation], self.subgoal_value[observation], observation
 
 
 def make_loss(steps=B * T, *, subgoals=G, actions=A, **settings):
