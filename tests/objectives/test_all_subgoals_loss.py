@@ -342,7 +342,8 @@ class TestInTheEnvironment:
         torch.manual_seed(0)
         env = small_env(8, max_steps=6, view=5)
         settings = tiny_settings(sampling="episode_starts", slice_len=10, batch_size=32, learning_rate=1e-2)
-        algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, memory_size=8, head_size=8, **options)
+        sizes = {"memory_size": 8, "head_size": 8, "prediction_steps": 0}
+        algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, **(sizes | options))
         self.learner = algorithm.learners["joint"]
         for batch in collect(algorithm, env, 20, batches=2):
             self.learner.store(batch)
@@ -354,7 +355,7 @@ class TestInTheEnvironment:
     def values(self, loss, td):
         """By the main and the target network, ``[B, T, G, A]`` and ``[B, T, G]`` each."""
         with torch.no_grad():
-            return [value for pair in loss._values(td) for value in pair]
+            return [value for pair in loss._values(td)[:2] for value in pair]
 
     @pytest.mark.parametrize("options", [{}, {"max_option_steps": 2, "trace_decay": 1.0}], ids=str)
     def test_losses(self, options):
@@ -374,7 +375,7 @@ class TestInTheEnvironment:
         found = {name: p.grad.clone() for name, p in network.named_parameters()}
         network.zero_grad()
         inputs = (td["observation"], td["previous_action"], td["is_init"].squeeze(-1), td["subgoal_mask"])
-        action_value, subgoal_value = network.unroll(*inputs)
+        action_value, subgoal_value, _ = network.unroll(*inputs)
         total = 0.0
         for (b, t, g), error in sub.items():
             total = total + 2 * error / len(sub) * action_value[b, t, g, td["action"][b, t]]
@@ -395,6 +396,39 @@ class TestInTheEnvironment:
         moved = {name for name, p in network.named_parameters() if p.grad is not None and (p.grad != 0).any()}
         assert any(name.startswith(("memory", "features")) for name in moved) == joint
         assert {"meta_head.0.weight", "sub_head.2.bias"} <= moved
+
+    def test_predictions_within_an_episode_enter_the_loss_and_train_the_memory(self):
+        loss, td = self.sample(prediction_steps=3, prediction_weight=0.5)
+        network, seen = self.learner.network.network, set()
+        rows, steps = td.shape
+        for seed in range(8):
+            torch.manual_seed(seed)
+            ahead = int(torch.randint(1, 4, ()))
+            torch.manual_seed(seed)
+            result = loss(td)
+            with torch.no_grad():
+                memory = loss._values(td)[2]
+                errors = network.predictor(memory, td["action"], td["observation"], steps=ahead)
+            kept = [
+                errors[b, t].item()
+                for b, t in product(range(rows), range(steps - ahead))
+                if not td["is_init"][b, t + 1 : t + ahead + 1].any()
+            ]
+            assert 0 < len(kept) < errors.numel()
+            assert result["prediction_loss"].item() == pytest.approx(sum(kept) / len(kept), rel=1e-4)
+            parts = (result["sub_loss"] + result["meta_loss"] + 0.5 * result["prediction_loss"]).item()
+            assert result["loss"].item() == pytest.approx(parts, rel=1e-5)
+            seen.add(ahead)
+        assert seen == {1, 2, 3} and set(result.keys()) == set(loss.out_keys)
+        with torch.no_grad():
+            for head in (network.sub_head[2], network.meta_head[2]):
+                head.weight.zero_()  # no way to the memory through the values
+        loss(td)["loss"].backward()
+        assert all((p.grad != 0).any() for p in network.memory.parameters())
+
+    def test_a_predictor_without_weight_is_not_run(self):
+        loss, td = self.sample(prediction_steps=3, prediction_weight=0.0)
+        assert "prediction_loss" not in loss(td) and "prediction_loss" not in loss.out_keys
 
     def test_the_target_moves_by_the_updater_only(self):
         loss, td = self.sample()
