@@ -7,7 +7,8 @@ runs      folders or glob patterns, in quotes, several in brackets; all runs at 
 out       what to write, by ending: .png .svg .pdf .csv; several in brackets
 kind      curves: the paper's four curves with greedy evaluations as points (default)
           greedy: greedy return, success, goals in order, steps; bars: final results
-columns   any columns of metrics.csv instead, one panel each: columns=greedy/return,greedy/success,sub/loss
+columns   any columns of metrics.csv instead, one panel each: columns=greedy/return,greedy/success,sub/loss; with
+          kind=bars also how long it took: columns='wall_seconds until behaviour/return>=1.01'
 x         frames (default), episodes, updates or wall_seconds
 by        what makes a group: algo (default), env, network, any setting (algo.sub.slice_len), several (algo,network),
           run (each run alone), or null (all together)
@@ -41,7 +42,7 @@ from configuration import SettingsError, command_line, read_choices
 from hdrqn_torchrl.comparison import FINALS, GREEDY, PAPER, Panel, plot_bars, plot_curves
 from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
 from hdrqn_torchrl.grouping import Entry, Row, differences, rows_of, task_key, task_of, value_of
-from hdrqn_torchrl.results import References, curve, find_runs, read_run
+from hdrqn_torchrl.results import References, curve, find_runs, read_run, source_of
 
 ALLOWED = {
     "kind": ("curves", "greedy", "bars"),
@@ -163,7 +164,8 @@ def choose_panels(settings: Settings, entries: list[Entry]) -> list[Panel]:
     if not (columns := as_list(settings.columns, split=True)):
         return list({"curves": PAPER, "greedy": GREEDY, "bars": FINALS}[settings.kind])
     known = {name for entry in entries for name in entry.run.metrics}
-    if unknown := [name for name in columns if name not in known]:
+    source = source_of if settings.kind == "bars" else str
+    if unknown := [name for name in columns if source(name) not in known]:
         raise SettingsError(f"columns must be some of {', '.join(sorted(known))}, got {unknown[0]!r}.")
     return [Panel(name) for name in columns]
 

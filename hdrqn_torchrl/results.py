@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import glob
 import json
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ References = dict[str, dict[str, float]]
 Array = NDArray[np.floating[Any]]
 
 METRICS_FILE = "metrics.csv"
+_UNTIL = re.compile(r"(?P<axis>frames|episodes|updates|wall_seconds) until (?P<column>\S+) *>= *(?P<level>-?[\d.]+)")
 
 
 @dataclass(frozen=True)
@@ -151,8 +153,27 @@ def smoothed(y: Array, window: float) -> Array:
     return np.convolve(y, ones, "same") / np.convolve(np.ones_like(y), ones, "same")
 
 
+def source_of(column: str) -> str:
+    """The column that a final value is read from; ``column`` itself, unless that asks for a time."""
+    asked = _UNTIL.fullmatch(column)
+    return asked["column"] if asked else column
+
+
 def final_value(run: Run, column: str) -> float:
-    """Final value of a ``greedy/...`` column: from the summary, else the last that was logged, else NaN."""
+    """What a run came to.
+
+    Args:
+        run: the run.
+        column: ``greedy/...``: from the summary, else the last that was logged. ``"frames until behaviour/return>=1"``:
+            frames (or episodes, updates, wall_seconds) at the first log point at which a column was as high.
+
+    Returns:
+        NaN if there is none.
+    """
+    if asked := _UNTIL.fullmatch(column):
+        x, y = curve(run, asked["column"], axis=asked["axis"])
+        high = y >= float(asked["level"])
+        return float(x[high.argmax()]) if high.any() else np.nan
     name = column.removeprefix("greedy/")
     for key in (f"{name}_mean", f"{name}_rate"):
         if key in run.summary:

@@ -131,6 +131,13 @@ def test_final_results_of_unfinished_runs_are_their_last_evaluation(run, outputs
     assert "dqn: unfinished are 1 of 2 runs" in err and "v2: unfinished" not in err
 
 
+def test_how_long_it_took(run, outputs):
+    run("runs=outputs", "out=[table.csv,a.png]", "kind=bars", "columns=[wall_seconds until behaviour/return>=3]")
+    rows = {row["group"]: row for row in table()}
+    assert [rows[group]["estimate"] for group in ("v2", "dqn")] == ["151.25", "181.5"]  # v2: 181.5 and 121
+    assert rows["dqn"]["seeds"] == "1" and rows["v2"]["metric"] == "wall_seconds until behaviour/return>=3"
+
+
 @pytest.mark.parametrize(
     ("x", "last"), [("frames", "400"), ("episodes", "28"), ("updates", "40"), ("wall_seconds", "242")]
 )
@@ -269,6 +276,8 @@ def test_a_folder_with_nothing_but_metrics_is_drawn(run, tmp_path):
         (["runs=outputs", "out=a.png", "by=alog"], "got 'alog', which none of them has"),
         (["runs=outputs", "out=a.png", "by=algo.sub"], "single settings, got 'algo.sub'"),
         (["runs=outputs", "out=a.png", "columns=greedy/retrun"], "got 'greedy/retrun'"),
+        (["runs=outputs", "out=a.png", "columns=frames until a>=1"], "got 'frames until a>=1'"),
+        (["runs=outputs", "out=a.png", "kind=bars", "columns=frames until a>=1"], "got 'frames until a>=1'"),
         (["runs=outputs", "out=a.png", "color=red"], "color"),
     ],
     ids=lambda value: value[-1] if isinstance(value, list) else "",

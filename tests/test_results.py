@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hdrqn_torchrl.results import Run, curve, find_runs, read_metrics, read_run, smoothed
+from hdrqn_torchrl.results import Run, curve, final_value, find_runs, read_metrics, read_run, smoothed, source_of
 
 NAN = math.nan
 
@@ -160,3 +160,23 @@ class TestCurve:
 
     def test_smoothing_keeps_short_curves_as_they_are(self):
         assert smoothed(np.array([1.0, 5.0]), 5).tolist() == [1, 5]
+
+
+class TestFinalValue:
+    @pytest.mark.parametrize(
+        ("asked", "expected"),
+        [
+            ("frames until behaviour/return>=1", 20),
+            ("wall_seconds until behaviour/return >= 0.5", 3),
+            ("frames until behaviour/return>=-1", 10),
+            ("frames until behaviour/return>=1.51", None),
+            ("frames until nothing>=1", None),
+        ],
+    )
+    def test_how_long_it_took(self, asked, expected):
+        run = run_of(frames=[0, 10, 20, 30], wall_seconds=[0, 3, 6, 9], behaviour__return=[NAN, 0.5, 1, 1.5])
+        assert final_value(run, asked) == pytest.approx(NAN if expected is None else expected, nan_ok=True)
+
+    def test_the_source_of_a_column(self):
+        assert source_of("frames until behaviour/return>=1") == "behaviour/return"
+        assert source_of("greedy/return") == "greedy/return"
