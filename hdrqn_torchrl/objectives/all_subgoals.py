@@ -12,7 +12,12 @@ belongs to every option that would have taken its action, and to the one pursued
 .. math:: y_t(g) = r^{ex}_t + \gamma_M U_{t+1}(g)
 
 with :math:`U(g) = \max_{g'} Q^M(s', g')` where g was attained, else :math:`(1 - \lambda_t) Q^M(s', g) + \lambda_t
-y_{t+1}(g)`. So the meta level, too, learns from every step and not only from those at which options begin.
+y_{t+1}(g)`. So the meta level, too, learns from every step and not only from those at which options begin. Without
+intra-option learning it learns where options begin only, from what the option brought (SMDP),
+
+.. math:: y = r^{ex}_0 + \gamma_M r^{ex}_1 + \dots + \gamma_M^k ((1 - \lambda') \max_{g'} Q^M(s_k, g') + \lambda' y_k)
+
+with :math:`\lambda'` = lambda where the next subgoal is the greedy one, else 0.
 
 Memory: if the network has a predictor, it is also trained to tell what the next few steps will show.
 """
@@ -31,6 +36,7 @@ from torchrl.objectives import LossModule
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
+from hdrqn_torchrl.modules.exploration import mask_values
 from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, watkins_trace
 
 
@@ -49,7 +55,9 @@ class AllSubgoalsLoss(LossModule):
             another one, meeting the hazard (which is not read if that is 0).
         double: Double Q-learning.
         all_subgoals: ``False``: only the subgoal that was pursued learns, at both levels.
-        intra_option: ``False``: the meta level learns from the steps at which options begin only.
+        intra_option: ``False``: the meta level learns from the steps at which options begin only, and of those whose
+            end is in the sequence. (``True`` takes options to last until their subgoal is attained: a step limit of
+            options is not seen.)
         max_meta_target: largest return of the task there can be, if known and never negative; the meta level's targets
             are kept between 0 and it.
         prediction_weight: of the error of the network's predictor, if it has one; how many steps ahead it looks is
@@ -145,7 +153,7 @@ class AllSubgoalsLoss(LossModule):
         action = steps[self.tensor_keys.action][..., None, None].expand(*events["attained"].shape, 1)
         sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
         meta_value = online[1][:, :-1]
-        sub_steps, meta_steps = self._trained(steps, events, agrees)
+        sub_steps, meta_steps = self._trained(tensordict, events, agrees)
         sub_loss, sub_error = _masked_square(sub_value, sub_target, sub_steps)
         meta_loss, meta_error = _masked_square(meta_value, meta_target, meta_steps)
         with torch.no_grad():
@@ -226,12 +234,16 @@ class AllSubgoalsLoss(LossModule):
         chooser = online if self.double else target
         sub_next = double_q_value(chooser[0], target[0])[:, 1:]
         best_next = double_q_value(chooser[1], target[1], mask)[:, 1:].unsqueeze(-1).expand_as(sub_next)
-        meta_next = torch.where(events["attained"], best_next, target[1][:, 1:])
         agrees = online[0].argmax(-1) == tensordict[self.tensor_keys.action].unsqueeze(-1)  # [B, T + 1, G]
         trace = watkins_trace(agrees, self.trace_decay)[:, :-1].masked_fill(events["unseen"], 0.0)
+        if self.intra_option:
+            meta_next = torch.where(events["attained"], best_next, target[1][:, 1:])
+            meta_trace = trace.masked_fill(events["attained"], 0.0)
+        else:
+            meta_next, meta_trace = best_next, self._option_trace(online[1], tensordict, events)
         # One recursion serves both levels, as columns beside each other.
         unseen = torch.cat([events["unseen"] & ~events["attained"], events["unseen"]], -1)
-        trace = torch.cat([trace, trace.masked_fill(events["attained"], 0.0)], -1)
+        trace = torch.cat([trace, meta_trace], -1)
         trace[:, :-1].masked_fill_(unseen[:, 1:], 0.0)  # there is no target to take over
         reward = torch.cat([events["sub_reward"], events["extrinsic_reward"]], -1)
         ended = torch.cat([events["sub_end"], events["meta_end"]], -1) | unseen
@@ -244,9 +256,20 @@ class AllSubgoalsLoss(LossModule):
             meta_target = meta_target.clamp(min=0.0, max=self.max_meta_target)
         return sub_target.clamp(max=self.reached_reward), meta_target, agrees[:, :-1]
 
-    def _trained(self, steps: TensorDictBase, events: dict[str, Tensor], agrees: Tensor) -> tuple[Tensor, Tensor]:
-        """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
+    def _option_trace(self, subgoal_value: Tensor, tensordict: TensorDictBase, events: dict[str, Tensor]) -> Tensor:
+        """Traces ``[B, T, G]`` along options: all inside them; lambda to the next one, if it is the greedy choice and
+        seen to its end."""
         k = self.tensor_keys
+        greedy = mask_values(subgoal_value, tensordict[self._policies[0].mask_key]).argmax(-1)
+        agrees = greedy == tensordict["next", k.active_subgoal]
+        to_next = watkins_trace(agrees, self.trace_decay)[:, :-1]
+        to_next[:, :-1] *= self._ends_in_sequence(tensordict, events)[:, 1:].squeeze(-1)
+        trace = torch.where(tensordict[k.option_init].squeeze(-1)[:, 1:], to_next, 1.0)
+        return trace.unsqueeze(-1).repeat(1, 1, subgoal_value.shape[-1])
+
+    def _trained(self, tensordict: TensorDictBase, events: dict[str, Tensor], agrees: Tensor) -> tuple[Tensor, Tensor]:
+        """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
+        k, steps = self.tensor_keys, tensordict[:, :-1]
         left = steps[self._policies[0].mask_key]
         pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
         sub_steps = left & (~events["unseen"] | events["attained"])
@@ -254,8 +277,18 @@ class AllSubgoalsLoss(LossModule):
         if not self.all_subgoals:
             sub_steps, meta_steps = sub_steps & pursued, meta_steps & pursued
         if not self.intra_option:
-            meta_steps = meta_steps & pursued & steps[k.option_init]
+            whole = self._ends_in_sequence(tensordict, events)
+            meta_steps = meta_steps & pursued & steps[k.option_init] & whole
         return sub_steps, meta_steps
+
+    def _ends_in_sequence(self, tensordict: TensorDictBase, events: dict[str, Tensor]) -> Tensor:
+        """Steps ``[B, T, 1]`` whose option ends within the sequence, what it led to included."""
+        seen = ~events["unseen"][..., :1]
+        ends = (tensordict[self.tensor_keys.option_init][:, 1:] | events["meta_end"][..., :1]) & seen
+        found = [torch.zeros_like(ends[:, 0])]
+        for end, visible in zip(reversed(ends.unbind(1)), reversed(seen.unbind(1)), strict=True):
+            found.append(end | (found[-1] & visible))
+        return torch.stack(found[:0:-1], 1)
 
 
 def _masked_mean(value: Tensor, mask: Tensor) -> Tensor:

@@ -40,6 +40,8 @@ CHANGES = [
     {"all_subgoals": False},
     {"intra_option": False},
     {"all_subgoals": False, "intra_option": False},
+    {"intra_option": False, "trace_decay": 0.0},
+    {"intra_option": False, "double": False},
     {"max_meta_target": 0.4},
 ]
 
@@ -143,7 +145,7 @@ class Reference:
                 target = min(self.sub_target(b, t, g), self.s.reached_reward)
                 sub[b, t, g] = self.q[b][t][g][self.action[b][t]] - target
             if self.trains_meta(b, t, g):
-                target = self.meta_target(b, t, g)
+                target = self.meta_target(b, t, g) if self.s.intra_option else self.option_target(b, t)
                 if self.s.max_meta_target is not None:
                     target = min(max(target, 0.0), self.s.max_meta_target)
                 meta[b, t, g] = self.m[b][t][g] - target
@@ -167,8 +169,31 @@ class Reference:
         if not self.s.all_subgoals:
             belongs = pursued
         if not self.s.intra_option:
-            belongs = pursued and self.starts[b][t]
+            belongs = pursued and self.starts[b][t] and self.option_end(b, t) is not None
         return self.left[b][t][g] and not self.cut_off(b, t) and belongs
+
+    def option_end(self, b, t):
+        """The step with which the option that is on at ``t`` ends, if it is known what that led to."""
+        while t < self.steps - 1 and not self.cut_off(b, t):
+            if self.terminated[b][t] or self.starts[b][t + 1]:
+                return t
+            t += 1
+        return None
+
+    def option_target(self, b, t):
+        """What the whole option brought, and the best that is left after it."""
+        last = self.option_end(b, t)
+        total = sum(self.s.meta_gamma ** (i - t) * self.extrinsic[b][i] for i in range(t, last + 1))
+        if self.terminated[b][last]:
+            return total
+        left = [other for other in range(self.subgoals) if self.left[b][last + 1][other]]
+        chooser = (self.m if self.s.double else self.target_m)[b][last + 1]
+        following = self.target_m[b][last + 1][max(left, key=lambda other: chooser[other])]
+        greedy = max(left, key=lambda other: self.m[b][last + 1][other]) == self.subgoal[b][last + 1]
+        if greedy and last + 1 < self.steps - 1 and self.option_end(b, last + 1) is not None:
+            decay = self.s.trace_decay
+            following = (1 - decay) * following + decay * self.option_target(b, last + 1)
+        return total + self.s.meta_gamma ** (last + 1 - t) * following
 
     def sub_target(self, b, t, g):
         reward = self.s.reached_reward if self.attained[b][t][g] else 0.0
