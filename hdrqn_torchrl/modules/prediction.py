@@ -1,9 +1,9 @@
 """What will be seen next, told from the memory: a second task that teaches a memory what is worth keeping.
 
 Q-learning tells a recurrent network little about what to remember: the value of a remembered place shows only where
-it is used. Whoever can tell what the next steps will show must know where it is and what stands around it. In theory,
-too, a memory that predicts observations and rewards is all that optimal control needs (approximate information state;
-Subramanian et al., 2022).
+it is used. Whoever can tell what the next steps will show must know where it is and what stands around it (Guo et al.,
+2018; Gregor et al., 2019). In theory, too, a memory that predicts observations and rewards is all that optimal control
+needs (approximate information states; Subramanian et al., 2022).
 """
 
 from __future__ import annotations
