@@ -381,6 +381,17 @@ class TestV3:
         with pytest.raises(ValueError, match=f"sampling must be 'episode_starts' for v3, got '{sampling}': "):
             self.make(learner={"sampling": sampling})
 
+    def test_settings_of_the_loss_reach_it(self):
+        changes = {"burn_in": 0.25, "loss_function": "smooth_l1", "double": False}
+        loss = self.make(learner=changes).learners["joint"].loss
+        assert {name: getattr(loss, name) for name in changes} == changes
+        loss = self.make(learner={"burn_in": 0.0, "train_exact_states": False}).learners["joint"].loss
+        assert not loss.train_exact_states
+
+    def test_one_bound_for_both_levels_is_refused(self):
+        with pytest.raises(ValueError, match=r"max_target must be None for v3, got 1.0; .* by max_meta_target"):
+            self.make(learner={"max_target": 1.0})
+
     def test_the_default_learner(self):
         assert V3_LEARNER.sampling == "episode_starts"
         algorithm = make_v3(small_env(2), NETWORKS["compact"])

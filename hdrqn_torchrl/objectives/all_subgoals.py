@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -26,10 +27,11 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
+from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
-from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, watkins_trace
+from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, training_mask, watkins_trace
 
 
 class AllSubgoalsLoss(LossModule):
@@ -50,6 +52,9 @@ class AllSubgoalsLoss(LossModule):
         intra_option: ``False``: the meta level learns from the steps at which options begin only.
         max_meta_target: largest return of the task there can be, if known and never negative; the meta level's targets
             are kept between 0 and it.
+        burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
+            in sequences that begin where an episode does, every state is exact.
+        loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -100,10 +105,17 @@ class AllSubgoalsLoss(LossModule):
         all_subgoals: bool = True,
         intra_option: bool = True,
         max_meta_target: float | None = None,
+        burn_in: float = 0.0,
+        train_exact_states: bool = True,
+        loss_function: Literal["l2", "smooth_l1"] = "l2",
     ) -> None:
         for name, value in (("sub_gamma", sub_gamma), ("meta_gamma", meta_gamma), ("trace_decay", trace_decay)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
+        if not 0.0 <= burn_in < 1.0:
+            raise ValueError(f"burn_in must lie in [0, 1), got {burn_in}; use 0 for sequences from an episode's start.")
+        if loss_function not in ("l2", "smooth_l1"):
+            raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the default is 'l2'.")
         super().__init__()
         self.convert_to_functional(policy, "policy", create_target_params=True)
         # As in RecurrentDQNLoss: the modules as they are called, outside the module tree.
@@ -114,6 +126,7 @@ class AllSubgoalsLoss(LossModule):
         self.reached_reward, self.wrong_subgoal_reward = reached_reward, wrong_subgoal_reward
         self.hazard_reward, self.double = hazard_reward, double
         self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
+        self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -136,8 +149,8 @@ class AllSubgoalsLoss(LossModule):
         sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
         meta_value = online[1][:, :-1]
         sub_steps, meta_steps = self._trained(steps, events, agrees)
-        sub_loss, sub_error = _masked_square(sub_value, sub_target, sub_steps)
-        meta_loss, meta_error = _masked_square(meta_value, meta_target, meta_steps)
+        sub_loss, sub_error = self._distance(sub_value, sub_target, sub_steps)
+        meta_loss, meta_error = self._distance(meta_value, meta_target, meta_steps)
         with torch.no_grad():
             report = {
                 "td_error": sub_error,
@@ -215,8 +228,10 @@ class AllSubgoalsLoss(LossModule):
 
     def _trained(self, steps: TensorDictBase, events: dict[str, Tensor], agrees: Tensor) -> tuple[Tensor, Tensor]:
         """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
-        k = self.tensor_keys
-        left = steps[self._policies[0].mask_key]
+        k, policy = self.tensor_keys, self._policies[0]
+        init = steps[policy.init_key].squeeze(-1)
+        warm = training_mask(torch.ones_like(init), init, self.burn_in, self.train_exact_states)  # [B, T]
+        left = steps[policy.mask_key] & warm.unsqueeze(-1)
         pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
         sub_steps = left & (~events["unseen"] | events["attained"])
         meta_steps = left & ~events["unseen"] & (agrees | pursued)
@@ -226,13 +241,13 @@ class AllSubgoalsLoss(LossModule):
             meta_steps = meta_steps & pursued & steps[k.option_init]
         return sub_steps, meta_steps
 
+    def _distance(self, value: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean loss and mean absolute error over ``mask``."""
+        error = (value - target).masked_fill(~mask, 0.0)
+        count = mask.sum().clamp(min=1)
+        distance = distance_loss(error, torch.zeros_like(error), self.loss_function)
+        return distance.sum() / count, error.detach().abs().sum() / count
+
 
 def _masked_mean(value: Tensor, mask: Tensor) -> Tensor:
     return value.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
-
-
-def _masked_square(value: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean squared and mean absolute error over ``mask``."""
-    error = (value - target).masked_fill(~mask, 0.0)
-    count = mask.sum().clamp(min=1)
-    return error.square().sum() / count, error.detach().abs().sum() / count

@@ -26,6 +26,9 @@ DEFAULTS = {
     "all_subgoals": True,
     "intra_option": True,
     "max_meta_target": None,
+    "burn_in": 0.0,
+    "train_exact_states": True,
+    "loss_function": "l2",
 }
 # Where each argument changes the loss on the random sequences below.
 CHANGES = [
@@ -41,6 +44,8 @@ CHANGES = [
     {"intra_option": False},
     {"all_subgoals": False, "intra_option": False},
     {"max_meta_target": 0.4},
+    {"burn_in": 0.5, "train_exact_states": False},
+    {"loss_function": "smooth_l1"},
 ]
 
 
@@ -129,6 +134,7 @@ class Reference:
         self.rows, self.steps, self.subgoals = td["subgoal_mask"].shape
         self.action = td["action"].tolist()
         self.left, self.starts = td["subgoal_mask"].tolist(), td["option_init"].squeeze(-1).tolist()
+        self.init = td["is_init"].squeeze(-1).tolist()
         after = td["next"]
         self.attained, self.subgoal = after["attained"].tolist(), after["active_subgoal"].tolist()
         names = ("hazard", "done", "terminated", "extrinsic_reward")
@@ -138,6 +144,9 @@ class Reference:
         """Errors of all trained entries by (row, time, subgoal), of the sub level and of the meta level."""
         sub, meta = {}, {}
         for b, t, g in product(range(self.rows), range(self.steps - 1), range(self.subgoals)):
+            exact = self.s.train_exact_states and any(self.init[b][: t + 1])
+            if t < int((self.steps - 1) * self.s.burn_in) and not exact:
+                continue
             if self.trains_sub(b, t, g):
                 target = min(self.sub_target(b, t, g), self.s.reached_reward)
                 sub[b, t, g] = self.q[b][t][g][self.action[b][t]] - target
@@ -205,6 +214,18 @@ def mean_square(errors):
     return sum(error**2 for error in errors.values()) / len(errors)
 
 
+def mean_loss(errors, loss_function="l2"):
+    if loss_function == "l2":
+        return mean_square(errors)
+    huber = [error**2 / 2 if abs(error) < 1 else abs(error) - 0.5 for error in errors.values()]
+    return sum(huber) / len(huber)
+
+
+def slope(error, loss_function="l2"):
+    """Derivative of one entry's loss by its value."""
+    return 2 * error if loss_function == "l2" else max(-1.0, min(1.0, error))
+
+
 class TestAgainstPlainLoops:
     @pytest.mark.parametrize("seed", [0, 1])
     @pytest.mark.parametrize("settings", [{}, *CHANGES], ids=str)
@@ -216,16 +237,17 @@ class TestAgainstPlainLoops:
         result = loss(td.clone())
         result["loss"].backward()
         sub, meta = Reference(in_sequences(loss), td, **settings).run()
-        assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-5)
-        assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-5)
-        assert result["loss"].item() == pytest.approx(mean_square(sub) + mean_square(meta), rel=1e-5)
+        function = settings.get("loss_function", "l2")
+        wanted = [mean_loss(errors, function) for errors in (sub, meta)]
+        assert [result["sub_loss"].item(), result["meta_loss"].item()] == pytest.approx(wanted, rel=1e-5)
+        assert result["loss"].item() == pytest.approx(sum(wanted), rel=1e-5)
 
         action_value, subgoal_value, *_ = tables(loss)
         expected_sub, expected_meta = torch.zeros_like(action_value), torch.zeros_like(subgoal_value)
         for (b, t, g), error in sub.items():
-            expected_sub[b * T + t, g, td["action"][b, t]] = 2 * error / len(sub)
+            expected_sub[b * T + t, g, td["action"][b, t]] = slope(error, function) / len(sub)
         for (b, t, g), error in meta.items():
-            expected_meta[b * T + t, g] = 2 * error / len(meta)
+            expected_meta[b * T + t, g] = slope(error, function) / len(meta)
         torch.testing.assert_close(action_value.grad, expected_sub, rtol=1e-4, atol=1e-7)
         torch.testing.assert_close(subgoal_value.grad, expected_meta, rtol=1e-4, atol=1e-7)
 
@@ -454,3 +476,15 @@ def test_sequences_without_anything_to_train():
 def test_wrong_values(name, value):
     with pytest.raises(ValueError, match=rf"{name} must lie in \[0, 1\], got {value}; "):
         make_loss(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
+        ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
+    ],
+)
+def test_wrong_values_of_the_loss_function_and_of_what_it_reads(settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_loss(**settings)
