@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector, refresh_hidden
+from hdrqn_torchrl.data import FROM_STARTS, OptionExtractor, OptionHistory, StepSelector, refresh_hidden
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
@@ -316,7 +316,8 @@ def make_v3(
     Args:
         env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
         architecture: where the features come from.
-        learner: how it learns; ``sampling`` must be ``"episode_starts"``, ``slice_len`` should cover an episode.
+        learner: how it learns; ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, ``slice_len`` should
+            cover an episode.
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
         memory_size: H, size of the LSTM.
         head_size: units of the heads' hidden layers.
@@ -335,10 +336,10 @@ def make_v3(
         >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['joint']
     """
-    if learner.sampling != "episode_starts":
+    if learner.sampling not in FROM_STARTS:
         raise ValueError(
-            f"sampling must be 'episode_starts' for v3, got {learner.sampling!r}: its memory lasts a whole episode and "
-            "would start empty in the middle of one."
+            f"sampling must be one of {FROM_STARTS} for v3, got {learner.sampling!r}: its memory lasts a whole episode "
+            "and would start empty in the middle of one."
         )
     if learner.max_target is not None:
         raise ValueError(

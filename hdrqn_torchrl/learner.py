@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
-from hdrqn_torchrl.data import Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
 
 
 class NonFiniteError(ArithmeticError):
@@ -96,7 +96,7 @@ class LearnerSettings:
             ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
             (
                 "train_exact_states",
-                self.train_exact_states or not (self.burn_in and self.sampling == "episode_starts"),
+                self.train_exact_states or not (self.burn_in and self.sampling in FROM_STARTS),
                 f"True with burn_in={self.burn_in} and sampling={self.sampling!r}",
                 "the first steps of an episode would never be trained; or use burn_in=0",
             ),

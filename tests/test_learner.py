@@ -221,7 +221,7 @@ class TestSettings:
         [
             ("burn_in", 1.0, r"burn_in must lie in \[0, 1\), got 1.0; "),
             ("loss_function", "l1", "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
-            ("sampling", "rows", "sampling must be 'steps', 'episodes' or 'episode_starts', got 'rows'; "),
+            ("sampling", "rows", "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),
         ],
     )
     def test_wrong_values_that_concern_its_parts(self, name, value, message):

@@ -38,7 +38,9 @@ class AllSubgoalsLoss(LossModule):
     """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + 1]`` of consecutive steps.
 
     The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
-    on through ends of episodes; each should begin where an episode does, because the memory starts empty.
+    on through ends of episodes; each should begin where an episode does, because the memory starts empty. Steps
+    after a sequence's end are padding (``mask``): they contribute nothing, and what the last real step led to is
+    unknown unless it ended the episode.
 
     Args:
         policy: network and keys.
@@ -73,6 +75,7 @@ class AllSubgoalsLoss(LossModule):
         terminated: NestedKey = keys.TERMINATED
         active_subgoal: NestedKey = keys.ACTIVE_SUBGOAL
         option_init: NestedKey = keys.OPTION_INIT
+        mask: NestedKey = keys.PAD_MASK
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -141,14 +144,14 @@ class AllSubgoalsLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         online, target = self._values(tensordict)
-        steps = tensordict[:, :-1]
-        events = self._events(steps)
+        steps, valid = tensordict[:, :-1], self._valid(tensordict)
+        events = self._events(steps, valid)
         with torch.no_grad():
             sub_target, meta_target, agrees = self._targets(online, target, tensordict, events)
         action = steps[self.tensor_keys.action][..., None, None].expand(*events["attained"].shape, 1)
         sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
         meta_value = online[1][:, :-1]
-        sub_steps, meta_steps = self._trained(steps, events, agrees)
+        sub_steps, meta_steps = self._trained(steps, valid[:, :-1], events, agrees)
         sub_loss, sub_error = self._distance(sub_value, sub_target, sub_steps)
         meta_loss, meta_error = self._distance(meta_value, meta_target, meta_steps)
         with torch.no_grad():
@@ -177,11 +180,17 @@ class AllSubgoalsLoss(LossModule):
                 target = run(target_policy)
             return run(policy), target
 
-    def _events(self, steps: TensorDictBase) -> dict[str, Tensor]:
+    def _valid(self, tensordict: TensorDictBase) -> Tensor:
+        """Which steps are no padding, ``[B, T + 1]`` bool."""
+        mask = tensordict.get(self.tensor_keys.mask, None)
+        return torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device) if mask is None else mask
+
+    def _events(self, steps: TensorDictBase, valid: Tensor) -> dict[str, Tensor]:
         """What each step ``[B, T]`` led to, as far as it does not depend on values."""
         k, after = self.tensor_keys, steps["next"]
         attained = after[k.attained]
         done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
+        last = valid[:, :-1] & ~valid[:, 1:]  # before padding
         other = attained.sum(-1, keepdim=True) > attained.long()  # [B, T, G]
         reward = self.reached_reward * attained + self.wrong_subgoal_reward * other
         if self.hazard_reward:
@@ -192,8 +201,8 @@ class AllSubgoalsLoss(LossModule):
             "extrinsic_reward": after[k.extrinsic_reward].expand_as(reward),
             "sub_end": attained | terminated.unsqueeze(-1),
             "meta_end": terminated.unsqueeze(-1).expand_as(attained),
-            # Cut off by a time limit: what follows is not in the sequence.
-            "unseen": (done & ~terminated).unsqueeze(-1).expand_as(attained),
+            # Cut off by a time limit, or by the sequence's end: what follows is not in the sequence.
+            "unseen": ((done | last) & ~terminated).unsqueeze(-1).expand_as(attained),
         }
 
     def _targets(
@@ -226,11 +235,13 @@ class AllSubgoalsLoss(LossModule):
             meta_target = meta_target.clamp(min=0.0, max=self.max_meta_target)
         return sub_target.clamp(max=self.reached_reward), meta_target, agrees[:, :-1]
 
-    def _trained(self, steps: TensorDictBase, events: dict[str, Tensor], agrees: Tensor) -> tuple[Tensor, Tensor]:
+    def _trained(
+        self, steps: TensorDictBase, valid: Tensor, events: dict[str, Tensor], agrees: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
         k, policy = self.tensor_keys, self._policies[0]
         init = steps[policy.init_key].squeeze(-1)
-        warm = training_mask(torch.ones_like(init), init, self.burn_in, self.train_exact_states)  # [B, T]
+        warm = training_mask(valid, init, self.burn_in, self.train_exact_states)  # [B, T]
         left = steps[policy.mask_key] & warm.unsqueeze(-1)
         pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
         sub_steps = left & (~events["unseen"] | events["attained"])
