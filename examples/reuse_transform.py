@@ -25,6 +25,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, GymWrapper, InitTracker, SerialEnv, TransformedEnv
 
 from hdrqn_torchrl import modules
+from hdrqn_torchrl.algorithms import make_recurrent_loss
 from hdrqn_torchrl.data import OptionExtractor, StepSelector
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.transforms import SubgoalTransform
@@ -71,10 +72,12 @@ def make_learners(sub: modules.SubController, meta: modules.MetaController) -> d
     options = OptionExtractor(input_keys=meta.input_keys, mask_key=None)
     option_keys = {"action": "subgoal", "reward": "option_return", "steps": "option_steps"}
     settings = partial(LearnerSettings, frames_per_update=8, warmup_frames=1000, tau=0.01, max_target=1.0)
-    step_keys = {**ends, "init": "option_init"}
+    sub_settings, meta_settings = settings(slice_len=8), settings(slice_len=4)
+    sub_loss = make_recurrent_loss(sub, sub_settings, loss_keys={**ends, "init": "option_init"})
+    meta_loss = make_recurrent_loss(meta, meta_settings, loss_keys=option_keys)
     return {
-        "sub": Learner(sub, settings(slice_len=8), extract=steps, loss_keys=step_keys, num_envs=NUM_ENVS),
-        "meta": Learner(meta, settings(slice_len=4), extract=options, loss_keys=option_keys),
+        "sub": Learner(sub, sub_settings, extract=steps, loss=sub_loss, num_envs=NUM_ENVS),
+        "meta": Learner(meta, meta_settings, extract=options, loss=meta_loss),
     }
 
 

@@ -6,19 +6,19 @@ level, and the transforms that the environment needs. The training loop never as
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector, refresh_hidden
+from hdrqn_torchrl.data import FROM_STARTS, OptionExtractor, OptionHistory, StepSelector, refresh_hidden
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
@@ -32,7 +32,7 @@ from hdrqn_torchrl.modules import (
     SubController,
     observation_decoder,
 )
-from hdrqn_torchrl.objectives import AllSubgoalsLoss
+from hdrqn_torchrl.objectives import AllSubgoalsLoss, RecurrentDQNLoss
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 V3_LEARNER = LearnerSettings(
@@ -60,6 +60,34 @@ class Algorithm:
     def transform(self, env: EnvBase) -> TransformedEnv:
         """The environment as this algorithm sees it."""
         return TransformedEnv(env, self.make_transforms())
+
+
+def make_recurrent_loss(
+    network: TensorDictModuleBase,
+    settings: LearnerSettings,
+    *,
+    gamma: float = 0.99,
+    loss_keys: Mapping[str, NestedKey | None] | None = None,
+) -> RecurrentDQNLoss:
+    """The loss of one level, as its settings have it.
+
+    Args:
+        network: the controller that is trained.
+        settings: how it learns.
+        gamma: discount of one environment step.
+        loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
+    """
+    loss = RecurrentDQNLoss(
+        network,
+        gamma=gamma,
+        burn_in=settings.burn_in,
+        train_exact_states=settings.train_exact_states,
+        loss_function=settings.loss_function,
+        double=settings.double,
+        max_target=settings.max_target,
+    )
+    loss.set_keys(**(loss_keys or {}))
+    return loss
 
 
 def make_drqn(
@@ -97,8 +125,7 @@ def make_drqn(
         extract=StepSelector(
             root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT], next_keys=[keys.OBSERVATION, keys.REWARD]
         ),
-        loss_keys={},
-        gamma=gamma,
+        loss=make_recurrent_loss(policy, learner, gamma=gamma),
         num_envs=env.batch_size[0],
     )
     return Algorithm(
@@ -206,13 +233,17 @@ def make_hdrqn(
             next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED],
             subgoal_key=keys.SUBGOAL,
         ),
-        loss_keys={
-            "reward": keys.INTRINSIC_REWARD,
-            "done": keys.OPTION_DONE,
-            "terminated": keys.OPTION_TERMINATED,
-            "init": keys.OPTION_INIT,
-        },
-        gamma=gamma,
+        loss=make_recurrent_loss(
+            sub_controller,
+            sub,
+            gamma=gamma,
+            loss_keys={
+                "reward": keys.INTRINSIC_REWARD,
+                "done": keys.OPTION_DONE,
+                "terminated": keys.OPTION_TERMINATED,
+                "init": keys.OPTION_INIT,
+            },
+        ),
         num_envs=env.batch_size[0],
     )
     meta_learner = Learner(
@@ -224,13 +255,17 @@ def make_hdrqn(
             at_end=partial(_read_last, sub_controller) if reads_last else None,
             history=history,
         ),
-        loss_keys={
-            "action": keys.SUBGOAL,
-            "reward": keys.OPTION_RETURN,
-            "steps": keys.OPTION_STEPS if smdp_discount else None,
-            "action_mask": mask_key,
-        },
-        gamma=gamma,
+        loss=make_recurrent_loss(
+            meta_controller,
+            meta,
+            gamma=gamma,
+            loss_keys={
+                "action": keys.SUBGOAL,
+                "reward": keys.OPTION_RETURN,
+                "steps": keys.OPTION_STEPS if smdp_discount else None,
+                "action_mask": mask_key,
+            },
+        ),
         refresh=refresh,
     )
 
@@ -285,7 +320,8 @@ def make_v3(
     Args:
         env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
         architecture: where the features come from.
-        learner: how it learns; ``sampling`` must be ``"episode_starts"``, ``slice_len`` should cover an episode.
+        learner: how it learns; ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, ``slice_len`` should
+            cover an episode.
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
         memory_size: H, size of the LSTM.
         head_size: units of the heads' hidden layers.
@@ -297,7 +333,8 @@ def make_v3(
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
 
     Raises:
-        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty.
+        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty; if
+            ``learner.max_target`` is given.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -305,10 +342,15 @@ def make_v3(
         >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['joint']
     """
-    if learner.sampling != "episode_starts":
+    if learner.sampling not in FROM_STARTS:
         raise ValueError(
-            f"sampling must be 'episode_starts' for v3, got {learner.sampling!r}: its memory lasts a whole episode and "
-            "would start empty in the middle of one."
+            f"sampling must be one of {FROM_STARTS} for v3, got {learner.sampling!r}: its memory lasts a whole episode "
+            "and would start empty in the middle of one."
+        )
+    if learner.max_target is not None:
+        raise ValueError(
+            f"max_target must be None for v3, got {learner.max_target}; its levels are bounded apart: the sub level by "
+            "the reward for reaching the subgoal, the meta level by max_meta_target."
         )
     observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
@@ -344,6 +386,9 @@ def make_v3(
         intra_option=intra_option,
         max_meta_target=max_meta_target,
         prediction_weight=prediction_weight,
+        burn_in=learner.burn_in,
+        train_exact_states=learner.train_exact_states,
+        loss_function=learner.loss_function,
     )
     stored = StepSelector(
         root_keys=[

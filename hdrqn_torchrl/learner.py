@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
-from hdrqn_torchrl.data import Sampling, make_sequence_buffer, sample_sequences
-from hdrqn_torchrl.objectives import RecurrentDQNLoss
+from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
 
 
 class NonFiniteError(ArithmeticError):
@@ -35,6 +34,9 @@ class Extract(Protocol):
 @dataclass(frozen=True, kw_only=True)
 class LearnerSettings:
     """How one level learns. The defaults are the paper's where it states them.
+
+    :class:`Learner` reads what concerns drawing and stepping. ``burn_in``, ``train_exact_states``, ``loss_function``,
+    ``double`` and ``max_target`` concern the loss; the builders of :mod:`hdrqn_torchrl.algorithms` pass them on.
 
     Args:
         slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level).
@@ -92,6 +94,12 @@ class LearnerSettings:
             ),
             ("learning_rate_frames", self.learning_rate_frames >= 1, ">= 1", "use the frames of the whole training"),
             ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
+            (
+                "train_exact_states",
+                self.train_exact_states or not (self.burn_in and self.sampling in FROM_STARTS),
+                f"True with burn_in={self.burn_in} and sampling={self.sampling!r}",
+                "the first steps of an episode would never be trained; or use burn_in=0",
+            ),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
         )
         for name, holds, rule, remedy in rules:
@@ -107,10 +115,9 @@ class Learner:
         settings: how it learns.
         extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet; with
             ``state_dict`` and ``load_state_dict``.
-        loss_keys: keys of a :class:`RecurrentDQNLoss` that is built from ``settings``; or
-        loss: a built loss that writes ``"loss"``.
+        loss: reads a minibatch ``[batch_size, slice_len + lookahead]``, writes ``"loss"``, which is minimised, and
+            scalars to report.
         lookahead: steps that a minibatch's sequences have beyond ``slice_len``.
-        gamma: discount of one environment step.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
         refresh: applied to every minibatch before it is learned from.
         samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
@@ -126,16 +133,14 @@ class Learner:
         settings: LearnerSettings,
         *,
         extract: Extract,
-        loss_keys: dict[str, NestedKey | None] | None = None,
-        loss: LossModule | None = None,
+        loss: LossModule,
         lookahead: int = 0,
-        gamma: float = 0.99,
         num_envs: int | None = None,
         refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
         self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
-        self.loss = _recurrent_loss(network, settings, gamma, loss_keys or {}) if loss is None else loss
+        self.loss = loss
         self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
         self._parameters = list(network.parameters())
         self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, fused=True)
@@ -240,19 +245,3 @@ class Learner:
         self.extract.load_state_dict(state["extract"])
         self._drawn = list(state["drawn"])
         self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
-
-
-def _recurrent_loss(
-    network: TensorDictModuleBase, settings: LearnerSettings, gamma: float, loss_keys: dict[str, NestedKey | None]
-) -> RecurrentDQNLoss:
-    loss = RecurrentDQNLoss(
-        network,
-        gamma=gamma,
-        burn_in=settings.burn_in,
-        train_exact_states=settings.train_exact_states,
-        loss_function=settings.loss_function,
-        double=settings.double,
-        max_target=settings.max_target,
-    )
-    loss.set_keys(**loss_keys)
-    return loss

@@ -6,6 +6,7 @@ from helpers import ALGORITHMS, build, collect, make_collector, parameter_distan
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_hdqn, make_hdrqn, make_v3
+from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
 
@@ -378,9 +379,39 @@ class TestV3:
         assert "repeated_action" not in batch and "repeated_action" not in batch["next"]
 
     @pytest.mark.parametrize("sampling", ["steps", "episodes"])
-    def test_other_sampling_is_refused(self, sampling):
-        with pytest.raises(ValueError, match=f"sampling must be 'episode_starts' for v3, got '{sampling}': "):
+    def test_sampling_in_mid_episode_is_refused(self, sampling):
+        with pytest.raises(ValueError, match=rf"sampling must be one of \(.*\) for v3, got '{sampling}': "):
             self.make(learner={"sampling": sampling})
+
+    def test_whole_episodes_teach_what_sequences_that_run_on_do(self):
+        """Cut off behind their first episode, sequences that run on are those that are padded there."""
+        algorithm, batch = self.steps(prediction_steps=0, learner={"slice_len": 7, "batch_size": 64})
+        learner, losses = algorithm.learners["joint"], {}
+        for sampling in ("episode_starts", "whole_episodes"):
+            settings = {"slice_len": 8, "batch_size": 512, "num_envs": 8, "sampling": sampling}
+            buffer = make_sequence_buffer(2_000, **settings)
+            buffer.extend(learner.extract(batch))
+            sample = sample_sequences(buffer, 8)
+            if sampling == "episode_starts":
+                sample["collector", "mask"] = sample["is_init"].squeeze(-1).cumsum(-1) == 1
+            rows = {row["collector", "traj_ids"][0, 0].item(): row for row in sample.split(1)}
+            for traj, row in sorted(rows.items())[:40]:
+                losses.setdefault(traj, {})[sampling] = learner.loss(row)["loss"]
+        both = [tuple(found.values()) for found in losses.values() if len(found) == 2]
+        assert len(both) > 20 and sum(first > 0 for first, _ in both) > 20
+        for first, second in both:
+            torch.testing.assert_close(first, second)
+
+    def test_settings_of_the_loss_reach_it(self):
+        changes = {"burn_in": 0.25, "loss_function": "smooth_l1", "double": False}
+        loss = self.make(learner=changes).learners["joint"].loss
+        assert {name: getattr(loss, name) for name in changes} == changes
+        loss = self.make(learner={"burn_in": 0.0, "train_exact_states": False}).learners["joint"].loss
+        assert not loss.train_exact_states
+
+    def test_one_bound_for_both_levels_is_refused(self):
+        with pytest.raises(ValueError, match=r"max_target must be None for v3, got 1.0; .* by max_meta_target"):
+            self.make(learner={"max_target": 1.0})
 
     def test_the_default_learner(self):
         assert V3_LEARNER.sampling == "episode_starts"

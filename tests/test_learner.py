@@ -5,6 +5,7 @@ import torch
 from helpers import build, collect, parameter_distance, small_env, tiny_settings
 from tensordict import TensorDict
 
+from hdrqn_torchrl.algorithms import make_recurrent_loss
 from hdrqn_torchrl.learner import Learner, LearnerSettings, NonFiniteError
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
 
@@ -14,11 +15,12 @@ def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, **settings):
     network = QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=2, hidden_size=6)
     controller = SubController(network, subgoal_key=None, init_key="is_init")
     keep = extract or (lambda batch: batch)
+    settings = tiny_settings(**settings)
     return Learner(
         controller,
-        tiny_settings(**settings),
+        settings,
         extract=keep,
-        loss_keys={},
+        loss=make_recurrent_loss(controller, settings),
         num_envs=num_envs,
         samples_per_draw=samples_per_draw,
     )
@@ -208,12 +210,18 @@ class TestSettings:
         with pytest.raises(ValueError, match=f"{name} must be {rule}, got {value}; "):
             tiny_settings(**{name: value})
 
+    def test_the_beginning_of_episodes_cannot_be_left_out_for_good(self):
+        settings = {"sampling": "episode_starts", "train_exact_states": False}
+        with pytest.raises(ValueError, match=r"with burn_in=0.5 and sampling='episode_starts', got False; "):
+            tiny_settings(**settings)
+        assert not tiny_settings(**settings, burn_in=0.0).train_exact_states
+
     @pytest.mark.parametrize(
         ("name", "value", "message"),
         [
             ("burn_in", 1.0, r"burn_in must lie in \[0, 1\), got 1.0; "),
             ("loss_function", "l1", "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
-            ("sampling", "rows", "sampling must be 'steps', 'episodes' or 'episode_starts', got 'rows'; "),
+            ("sampling", "rows", "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),
         ],
     )
     def test_wrong_values_that_concern_its_parts(self, name, value, message):

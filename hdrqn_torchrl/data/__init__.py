@@ -2,21 +2,18 @@
 
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
-from hdrqn_torchrl.data.replay import (
-    EpisodeStartSampler,
-    Sampling,
-    StepSliceSampler,
-    make_sequence_buffer,
-    sample_sequences,
-)
+from hdrqn_torchrl.data.replay import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
 
 __all__ = [
+    "FROM_STARTS",
     "EpisodeStartSampler",
     "OptionExtractor",
     "OptionHistory",
     "Sampling",
     "StepSelector",
     "StepSliceSampler",
+    "WholeEpisodeSampler",
     "make_sequence_buffer",
     "refresh_hidden",
     "sample_sequences",

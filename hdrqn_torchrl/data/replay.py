@@ -6,104 +6,14 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torch import Tensor
-from torchrl.data import LazyTensorStorage, SliceSampler, Storage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
 
-Sampling = Literal["steps", "episodes", "episode_starts"]
-
-
-class StepSliceSampler(SliceSampler):
-    """Slices that start at a uniformly random *step*; TorchRL's ``SliceSampler`` picks an episode first.
-
-    How long an episode lasts depends on what happened in it. To pick episodes uniformly shows each step of a
-    short (say, successful) episode more often than it occurs, and shows its last steps less often than those in
-    its middle; Q-values of a stochastic task are then biased. Here whether a step is shown depends on its past
-    only. A slice that meets the end of its episode is padded and ``("collector", "mask")`` tells its real steps.
-
-    Args:
-        slice_len: steps of a slice.
-        traj_key: entry that numbers the episodes.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> sampler = StepSliceSampler(slice_len=4, traj_key="episode")
-        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=8)
-        >>> _ = buffer.extend(TensorDict(episode=torch.tensor([0, 0, 0, 1, 1]), batch_size=5))
-        >>> buffer.sample().reshape(2, 4)["collector", "mask"].shape
-        torch.Size([2, 4])
-    """
-
-    def __init__(self, *, slice_len: int, traj_key: NestedKey = keys.TRAJ_IDS) -> None:
-        super().__init__(
-            slice_len=slice_len,
-            traj_key=traj_key,
-            truncated_key=None,
-            init_key=None,
-            cache_values=True,
-            strict_length=False,
-            pad_output=True,
-        )
-
-    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
-        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
-        length, count = self._adjusted_batch_size(batch_size)
-        ends = lengths.cumsum(0)
-        step = torch.randint(int(ends[-1]), (count,), device=ends.device, generator=self._rng)
-        episode = torch.searchsorted(ends, step, right=True)
-        left = ends[episode] - step  # real steps from the start of the slice on
-        offset = torch.arange(length, device=ends.device)
-        mask = offset < left.unsqueeze(-1)  # [B, T]
-        time = first[episode, 0] + lengths[episode] - left
-        time = time.unsqueeze(-1) + torch.minimum(offset, left.unsqueeze(-1) - 1)  # padding repeats the last step
-        index = [(time % storage.shape[0]).flatten()]
-        index += [place.repeat_interleave(length) for place in first[episode, 1:].unbind(-1)]
-        return tuple(index), {keys.PAD_MASK: mask.flatten()}
-
-
-class EpisodeStartSampler(SliceSampler):
-    """Slices that start where a random episode starts, and run on into the next ones if it is shorter.
-
-    The recurrent state of every step is exact, no step is padding, and whether a step is shown depends on its past only
-    (see :class:`StepSliceSampler`). Needs a storage of two dimensions (time, environment).
-
-    Args:
-        slice_len: steps of a slice; an episode's later steps are never shown.
-        init_key: first step of an episode.
-        traj_key: entry that numbers the episodes.
-    """
-
-    def __init__(
-        self, *, slice_len: int, init_key: NestedKey = keys.IS_INIT, traj_key: NestedKey = keys.TRAJ_IDS
-    ) -> None:
-        super().__init__(slice_len=slice_len, traj_key=traj_key, truncated_key=None, init_key=None, cache_values=True)
-        self.first_key = init_key
-
-    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
-        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        length, count = self._adjusted_batch_size(batch_size)
-        contents = storage._mutation_revision
-        if contents not in self._cache:
-            self._cache.clear()
-            self._cache[contents] = self._find_starts(storage, length)
-        time, environment = self._cache[contents]
-        if not len(time):
-            raise RuntimeError(
-                f"no stored start of an episode begins slice_len={length} stored steps; update later, raise capacity "
-                "or use shorter slices."
-            )
-        chosen = torch.randint(len(time), (count,), device=time.device, generator=self._rng)
-        times = time[chosen].unsqueeze(-1) + torch.arange(length, device=time.device)
-        return ((times % storage.shape[0]).flatten(), environment[chosen].repeat_interleave(length)), {}
-
-    def _find_starts(self, storage: Storage, length: int) -> tuple[Tensor, Tensor]:
-        """Time and environment of every first step that ``length - 1`` newer steps follow."""
-        init = storage[:].get(self.first_key).squeeze(-1)  # [rows, N]
-        newest = storage._last_cursor_index
-        age = (newest - torch.arange(len(init), device=init.device)) % len(init)
-        return (init & (age >= length - 1).unsqueeze(-1)).nonzero(as_tuple=True)  # type: ignore[return-value]
+Sampling = Literal["steps", "episodes", "episode_starts", "whole_episodes"]
+FROM_STARTS = ("episode_starts", "whole_episodes")
+"""Samplings whose sequences all begin where an episode does, so that the zero state is exact."""
 
 
 class SequenceStorage(LazyTensorStorage):
@@ -154,7 +64,9 @@ def make_sequence_buffer(
             ``[M]`` that keep each episode together (options).
         sampling: ``"steps"``: every step is equally likely to start a slice (:class:`StepSliceSampler`);
             ``"episodes"``: a random episode, then a random start in it, as the paper describes it;
-            ``"episode_starts"``: from the start of a random episode on (:class:`EpisodeStartSampler`).
+            ``"episode_starts"``: from the start of a random episode on, and into the next ones
+            (:class:`EpisodeStartSampler`); ``"whole_episodes"``: the same, padded after the episode's end
+            (:class:`WholeEpisodeSampler`).
         traj_key: entry that numbers the episodes.
         device: device of the storage.
 
@@ -177,29 +89,31 @@ def make_sequence_buffer(
             f"capacity must hold at least slice_len={slice_len} transitions of each of {num_envs or 1} environments, "
             f"got {capacity}; the paper keeps 100,000 steps and 50,000 options."
         )
-    if sampling == "steps":
-        sampler = StepSliceSampler(slice_len=slice_len, traj_key=traj_key)
-    elif sampling == "episode_starts":
-        if num_envs is None:
-            raise ValueError("sampling must be 'steps' or 'episodes' for rows, got 'episode_starts'.")
-        sampler = EpisodeStartSampler(slice_len=slice_len, traj_key=traj_key)
-    elif sampling == "episodes":
-        sampler = SliceSampler(
-            slice_len=slice_len,
-            traj_key=traj_key,
-            init_key=None,  # keep the stored flag: it tells true starts of episodes
-            cache_values=True,
-            strict_length=False,
-            pad_output=True,
-        )
-    else:
-        raise ValueError(
-            f"sampling must be 'steps', 'episodes' or 'episode_starts', got {sampling!r}; the paper's is 'episodes'."
-        )
+    if sampling == "episode_starts" and num_envs is None:
+        raise ValueError("sampling must be 'steps', 'episodes' or 'whole_episodes' for rows, got 'episode_starts'.")
     return TensorDictReplayBuffer(
         storage=SequenceStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
-        sampler=sampler,
+        sampler=_make_sampler(sampling, slice_len, traj_key),
         batch_size=batch_size * slice_len,
+    )
+
+
+def _make_sampler(sampling: Sampling, slice_len: int, traj_key: NestedKey) -> SliceSampler:
+    own = {"steps": StepSliceSampler, "episode_starts": EpisodeStartSampler, "whole_episodes": WholeEpisodeSampler}
+    if sampling in own:
+        return own[sampling](slice_len=slice_len, traj_key=traj_key)
+    if sampling != "episodes":
+        raise ValueError(
+            f"sampling must be 'steps', 'episodes', 'episode_starts' or 'whole_episodes', got {sampling!r}; the paper "
+            "has 'episodes'."
+        )
+    return SliceSampler(
+        slice_len=slice_len,
+        traj_key=traj_key,
+        init_key=None,  # keep the stored flag: it tells true starts of episodes
+        cache_values=True,
+        strict_length=False,
+        pad_output=True,
     )
 
 

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from copy import deepcopy
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -33,18 +34,21 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
+from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
 from hdrqn_torchrl.modules.exploration import mask_values
-from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, watkins_trace
+from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, training_mask, watkins_trace
 
 
 class AllSubgoalsLoss(LossModule):
     """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + 1]`` of consecutive steps.
 
     The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
-    on through ends of episodes; each should begin where an episode does, because the memory starts empty.
+    on through ends of episodes; each should begin where an episode does, because the memory starts empty. Steps
+    after a sequence's end are padding (``mask``): they contribute nothing, and what the last real step led to is
+    unknown unless it ended the episode.
 
     Args:
         policy: network and keys.
@@ -60,6 +64,9 @@ class AllSubgoalsLoss(LossModule):
             options is not seen.)
         max_meta_target: largest return of the task there can be, if known and never negative; the meta level's targets
             are kept between 0 and it.
+        burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
+            in sequences that begin where an episode does, every state is exact.
+        loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
         prediction_weight: of the error of the network's predictor, if it has one; how many steps ahead it looks is
             drawn anew for every minibatch.
 
@@ -80,6 +87,7 @@ class AllSubgoalsLoss(LossModule):
         terminated: NestedKey = keys.TERMINATED
         active_subgoal: NestedKey = keys.ACTIVE_SUBGOAL
         option_init: NestedKey = keys.OPTION_INIT
+        mask: NestedKey = keys.PAD_MASK
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -112,6 +120,9 @@ class AllSubgoalsLoss(LossModule):
         all_subgoals: bool = True,
         intra_option: bool = True,
         max_meta_target: float | None = None,
+        burn_in: float = 0.0,
+        train_exact_states: bool = True,
+        loss_function: Literal["l2", "smooth_l1"] = "l2",
         prediction_weight: float = 0.1,
     ) -> None:
         if prediction_weight < 0.0:
@@ -119,6 +130,10 @@ class AllSubgoalsLoss(LossModule):
         for name, value in (("sub_gamma", sub_gamma), ("meta_gamma", meta_gamma), ("trace_decay", trace_decay)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
+        if not 0.0 <= burn_in < 1.0:
+            raise ValueError(f"burn_in must lie in [0, 1), got {burn_in}; use 0 for sequences from an episode's start.")
+        if loss_function not in ("l2", "smooth_l1"):
+            raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the default is 'l2'.")
         super().__init__()
         self.convert_to_functional(policy, "policy", create_target_params=True)
         # As in RecurrentDQNLoss: the modules as they are called, outside the module tree.
@@ -129,6 +144,7 @@ class AllSubgoalsLoss(LossModule):
         self.reached_reward, self.wrong_subgoal_reward = reached_reward, wrong_subgoal_reward
         self.hazard_reward, self.double = hazard_reward, double
         self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
+        self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
         self.prediction_weight = prediction_weight
         if self._predicts:
             self.out_keys = [*self.out_keys, "prediction_loss"]
@@ -146,16 +162,16 @@ class AllSubgoalsLoss(LossModule):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         online, target, memory = self._values(tensordict)
-        steps = tensordict[:, :-1]
-        events = self._events(steps)
+        steps, valid = tensordict[:, :-1], self._valid(tensordict)
+        events = self._events(steps, valid)
         with torch.no_grad():
             sub_target, meta_target, agrees = self._targets(online, target, tensordict, events)
         action = steps[self.tensor_keys.action][..., None, None].expand(*events["attained"].shape, 1)
         sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
         meta_value = online[1][:, :-1]
-        sub_steps, meta_steps = self._trained(tensordict, events, agrees)
-        sub_loss, sub_error = _masked_square(sub_value, sub_target, sub_steps)
-        meta_loss, meta_error = _masked_square(meta_value, meta_target, meta_steps)
+        sub_steps, meta_steps = self._trained(tensordict, valid[:, :-1], events, agrees)
+        sub_loss, sub_error = self._distance(sub_value, sub_target, sub_steps)
+        meta_loss, meta_error = self._distance(meta_value, meta_target, meta_steps)
         with torch.no_grad():
             report = {
                 "td_error": sub_error,
@@ -167,7 +183,7 @@ class AllSubgoalsLoss(LossModule):
             }
         losses = {"loss": sub_loss + meta_loss, "sub_loss": sub_loss.detach(), "meta_loss": meta_loss.detach()}
         if self._predicts:
-            prediction_loss = self._prediction_loss(memory, tensordict)
+            prediction_loss = self._prediction_loss(memory, tensordict, valid)
             losses["loss"] = losses["loss"] + self.prediction_weight * prediction_loss
             losses["prediction_loss"] = prediction_loss.detach()
         return TensorDict({**losses, **report}, [])
@@ -176,7 +192,7 @@ class AllSubgoalsLoss(LossModule):
     def _predicts(self) -> bool:
         return self._policies[0].network.predictor is not None and self.prediction_weight > 0.0
 
-    def _prediction_loss(self, memory: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _prediction_loss(self, memory: Tensor, tensordict: TensorDictBase, valid: Tensor) -> Tensor:
         """Mean error over the steps whose next ``ahead`` steps are of the same episode."""
         policy = self._policies[0]
         predictor = policy.network.predictor
@@ -184,7 +200,7 @@ class AllSubgoalsLoss(LossModule):
         observation, action = tensordict[policy.observation_key], tensordict[self.tensor_keys.action]
         error = predictor(memory, action, observation, steps=ahead)
         begins = tensordict[policy.init_key].squeeze(-1)[:, 1:]
-        return _masked_mean(error, ~begins.unfold(1, ahead, 1).any(-1))
+        return _masked_mean(error, valid[:, ahead:] & ~begins.unfold(1, ahead, 1).any(-1))
 
     def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Tensor]:
         """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network; the main
@@ -203,11 +219,17 @@ class AllSubgoalsLoss(LossModule):
             *online, memory = run(policy)
             return tuple(online), target, memory  # type: ignore[return-value]
 
-    def _events(self, steps: TensorDictBase) -> dict[str, Tensor]:
+    def _valid(self, tensordict: TensorDictBase) -> Tensor:
+        """Which steps are no padding, ``[B, T + 1]`` bool."""
+        mask = tensordict.get(self.tensor_keys.mask, None)
+        return torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device) if mask is None else mask
+
+    def _events(self, steps: TensorDictBase, valid: Tensor) -> dict[str, Tensor]:
         """What each step ``[B, T]`` led to, as far as it does not depend on values."""
         k, after = self.tensor_keys, steps["next"]
         attained = after[k.attained]
         done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
+        last = valid[:, :-1] & ~valid[:, 1:]  # before padding
         other = attained.sum(-1, keepdim=True) > attained.long()  # [B, T, G]
         reward = self.reached_reward * attained + self.wrong_subgoal_reward * other
         if self.hazard_reward:
@@ -218,8 +240,8 @@ class AllSubgoalsLoss(LossModule):
             "extrinsic_reward": after[k.extrinsic_reward].expand_as(reward),
             "sub_end": attained | terminated.unsqueeze(-1),
             "meta_end": terminated.unsqueeze(-1).expand_as(attained),
-            # Cut off by a time limit: what follows is not in the sequence.
-            "unseen": (done & ~terminated).unsqueeze(-1).expand_as(attained),
+            # Cut off by a time limit, or by the sequence's end: what follows is not in the sequence.
+            "unseen": ((done | last) & ~terminated).unsqueeze(-1).expand_as(attained),
         }
 
     def _targets(
@@ -267,10 +289,14 @@ class AllSubgoalsLoss(LossModule):
         trace = torch.where(tensordict[k.option_init].squeeze(-1)[:, 1:], to_next, 1.0)
         return trace.unsqueeze(-1).repeat(1, 1, subgoal_value.shape[-1])
 
-    def _trained(self, tensordict: TensorDictBase, events: dict[str, Tensor], agrees: Tensor) -> tuple[Tensor, Tensor]:
+    def _trained(
+        self, tensordict: TensorDictBase, valid: Tensor, events: dict[str, Tensor], agrees: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
-        k, steps = self.tensor_keys, tensordict[:, :-1]
-        left = steps[self._policies[0].mask_key]
+        k, policy, steps = self.tensor_keys, self._policies[0], tensordict[:, :-1]
+        init = steps[policy.init_key].squeeze(-1)
+        warm = training_mask(valid, init, self.burn_in, self.train_exact_states)  # [B, T]
+        left = steps[policy.mask_key] & warm.unsqueeze(-1)
         pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
         sub_steps = left & (~events["unseen"] | events["attained"])
         meta_steps = left & ~events["unseen"] & (agrees | pursued)
@@ -290,13 +316,13 @@ class AllSubgoalsLoss(LossModule):
             found.append(end | (found[-1] & visible))
         return torch.stack(found[:0:-1], 1)
 
+    def _distance(self, value: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean loss and mean absolute error over ``mask``."""
+        error = (value - target).masked_fill(~mask, 0.0)
+        count = mask.sum().clamp(min=1)
+        distance = distance_loss(error, torch.zeros_like(error), self.loss_function)
+        return distance.sum() / count, error.detach().abs().sum() / count
+
 
 def _masked_mean(value: Tensor, mask: Tensor) -> Tensor:
     return value.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
-
-
-def _masked_square(value: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean squared and mean absolute error over ``mask``."""
-    error = (value - target).masked_fill(~mask, 0.0)
-    count = mask.sum().clamp(min=1)
-    return error.square().sum() / count, error.detach().abs().sum() / count

@@ -3,8 +3,9 @@ import torch
 from tensordict import TensorDict
 
 from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data.samplers import episode_starts
 
-SAMPLINGS = ["steps", "episodes"]
+PADDED = ["steps", "episodes", "whole_episodes"]
 
 
 class Stream:
@@ -53,8 +54,8 @@ def check_sequences(sequences, slice_len, newest):
     assert ((step == 0) == sequences["is_init"].squeeze(-1)).all()  # the flag of true starts is kept
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
 class TestSequencesOfSteps:
+    @pytest.mark.parametrize("sampling", PADDED)
     @pytest.mark.parametrize("num_envs", [1, 3])
     @pytest.mark.parametrize(("length", "slice_len"), [(2, 4), (3, 4), (8, 4), (2, 1)])
     def test_each_is_one_trajectory_before_and_after_the_ring_is_full(self, num_envs, length, slice_len, sampling):
@@ -72,6 +73,7 @@ class TestSequencesOfSteps:
             full += len(buffer) == capacity
         assert full > 5
 
+    @pytest.mark.parametrize("sampling", ["steps", "episodes"])
     def test_every_stored_step_is_shown(self, sampling):
         torch.manual_seed(0)
         buffer = make_sequence_buffer(90, slice_len=4, batch_size=64, num_envs=3, sampling=sampling)
@@ -85,6 +87,7 @@ class TestSequencesOfSteps:
         pairs = torch.stack([stored["collector", "traj_ids"], stored["step"]], -1).flatten(0, 1).tolist()
         assert seen == {tuple(pair) for pair in pairs}
 
+    @pytest.mark.parametrize("sampling", PADDED)
     def test_trajectories_shorter_than_the_slice_are_padded_not_dropped(self, sampling):
         buffer, stream = make_sequence_buffer(90, slice_len=30, batch_size=8, num_envs=3, sampling=sampling), Stream(3)
         buffer.extend(stream.take(30))
@@ -93,7 +96,7 @@ class TestSequencesOfSteps:
         assert not sequences["collector", "mask"].all(-1).any()
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("sampling", PADDED)
 def test_sequences_of_options_from_rows_of_whole_episodes(sampling):
     torch.manual_seed(0)
     buffer = make_sequence_buffer(40, slice_len=8, batch_size=16, sampling=sampling)
@@ -132,6 +135,39 @@ def test_sampling_by_episodes_picks_an_episode_first():
     assert shares[:2].sum().item() == pytest.approx(0.5, abs=0.05)
 
 
+class TestWholeEpisodes:
+    def test_each_episode_is_as_likely_and_shown_from_its_start_to_its_end(self):
+        torch.manual_seed(0)
+        buffer = make_sequence_buffer(10, slice_len=4, batch_size=3_000, sampling="whole_episodes")
+        buffer.extend(torch.cat([one_episode(0, 2), one_episode(1, 7), one_episode(2, 1)]))
+        sequences = sample_sequences(buffer, 4)
+        assert (sequences["step"][:, 0] == 0).all()
+        episode, real = sequences["collector", "traj_ids"][:, 0], sequences["collector", "mask"].sum(-1)
+        assert (real == torch.tensor([2, 4, 1])[episode]).all()
+        assert (episode.bincount() / 3_000).tolist() == pytest.approx([1 / 3] * 3, abs=0.04)
+
+    def test_an_episode_whose_start_was_written_over_is_not_shown(self):
+        torch.manual_seed(0)
+        buffer, stream = (
+            make_sequence_buffer(24, slice_len=3, batch_size=64, num_envs=2, sampling="whole_episodes"),
+            Stream(2),
+        )
+        beheaded = 0
+        for _ in range(20):
+            buffer.extend(stream.take(5))
+            stored = buffer.storage[:]
+            oldest = stored[(buffer.storage._last_cursor_index + 1) % len(stored)]
+            beheaded += (oldest["step"] > 0).sum().item()
+            assert (sample_sequences(buffer, 3)["step"][:, 0] == 0).all()
+        assert beheaded > 10
+
+    def test_without_any_start_it_says_what_to_do(self):
+        buffer = make_sequence_buffer(4, slice_len=2, batch_size=2, sampling="whole_episodes")
+        buffer.extend(one_episode(0, 6)[2:])
+        with pytest.raises(RuntimeError, match="raise capacity above the length of an episode"):
+            sample_sequences(buffer, 2)
+
+
 def test_the_device_is_that_of_the_storage():
     for device in ("cpu", "meta"):
         buffer = make_sequence_buffer(10, slice_len=2, batch_size=2, device=device)
@@ -145,8 +181,8 @@ def test_the_device_is_that_of_the_storage():
         ({"batch_size": 0}, "batch_size must be >= 1.*got 0; "),
         ({"capacity": 3}, "capacity must hold at least slice_len=4 .* of each of 1 environments, got 3; "),
         ({"capacity": 11, "num_envs": 3}, "capacity must hold at least slice_len=4 .* 3 environments, got 11; "),
-        ({"sampling": "rows"}, "sampling must be 'steps', 'episodes' or 'episode_starts', got 'rows'; "),
-        ({"sampling": "episode_starts"}, "sampling must be 'steps' or 'episodes' for rows, got 'episode_starts'"),
+        ({"sampling": "rows"}, "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),
+        ({"sampling": "episode_starts"}, "sampling must be 'steps', .* for rows, got 'episode_starts'"),
     ],
 )
 def test_wrong_values(settings, message):
@@ -155,7 +191,7 @@ def test_wrong_values(settings, message):
         make_sequence_buffer(settings.pop("capacity"), **settings)
 
 
-@pytest.mark.parametrize("sampling", ["steps", "episodes", "episode_starts"])
+@pytest.mark.parametrize("sampling", [*PADDED, "episode_starts"])
 @pytest.mark.parametrize("batches", [1, 3, 5, 8, 12], ids="after {} batches".format)
 class TestState:
     """A copy of a memory draws the same sequences, before and after it is full."""
@@ -234,6 +270,27 @@ class Recorder:
         self.now += length
         self.buffer.extend(batch)
 
+    def skip(self, length):
+        """Steps that are collected and never stored."""
+        self.stream.take(length)
+
+    def unbroken_starts(self):
+        """Valid starts whose slice does not go from one episode to another that it did not lead to."""
+        rows = self.buffer.storage[:].flatten()
+        columns = (rows["env"], rows["time"], rows["collector", "traj_ids"], rows["next", "done"].squeeze(-1))
+        stored = {
+            (env, time): (traj, done) for env, time, traj, done in zip(*map(torch.Tensor.tolist, columns), strict=True)
+        }
+
+        def is_broken(env, time):
+            (traj, done), (next_traj, _) = stored[env, time], stored[env, time + 1]
+            return traj != next_traj and not done
+
+        steps = range(self.slice_len - 1)
+        return {
+            (env, time) for env, time in self.valid_starts() if not any(is_broken(env, time + step) for step in steps)
+        }
+
     def valid_starts(self):
         """(environment, time) of starts that are stored with all the steps of a slice."""
         oldest, last = max(0, self.now - self.rows), self.now - self.slice_len
@@ -284,6 +341,36 @@ class TestEpisodeStarts:
         assert counts.sum() == 6_000 and len(valid) > 5
         assert ((counts - expected) ** 2 / expected).sum().item() < len(valid) + 6 * (2 * len(valid)) ** 0.5
 
+    @pytest.mark.parametrize("lost", [1, 2, 7, 13])
+    def test_no_slice_goes_over_steps_that_were_lost(self, lost):
+        """Batches that never came join an episode to a later one that it did not lead to."""
+        recorder, joined = Recorder(3, 6, rows=60), 0
+        for number in range(24):
+            if number % 3 == 2:
+                recorder.skip(lost)
+            recorder.extend(5)
+            if number < 8:
+                continue
+            sequences = recorder.sample()
+            after = sequences[:, 1:]
+            new = after["collector", "traj_ids"] != sequences["collector", "traj_ids"][:, :-1]
+            assert sequences["next", "done"][:, :-1].squeeze(-1)[new].all()
+            drawn = set(zip(sequences["env"][:, 0].tolist(), sequences["time"][:, 0].tolist(), strict=True))
+            allowed = recorder.unbroken_starts()
+            assert drawn <= allowed
+            joined += len(recorder.valid_starts() - allowed)
+        assert joined > 5
+
+    def test_an_episode_that_was_broken_off_joins_nothing(self):
+        """The collector started anew: the same numbers of episodes, and no end before a start."""
+        done = torch.zeros(6, 1, dtype=torch.bool)
+        init, episode = torch.tensor([1, 0, 0, 1, 0, 0]).bool()[:, None], torch.zeros(6, 1)
+        starts = episode_starts(init, episode, done, newest=5, length=3)
+        assert starts.flatten().tolist() == [True, False, False, True, False, False]
+        assert episode_starts(init, episode, done, newest=5, length=4).flatten().tolist() == [False] * 6
+        done[2] = True
+        assert episode_starts(init, episode, done, newest=5, length=4).flatten().tolist() == [True] + [False] * 5
+
     def test_without_a_start_that_has_enough_steps_it_says_what_to_do(self):
         recorder = Recorder(2, 12)
         recorder.extend(10)
@@ -293,7 +380,7 @@ class TestEpisodeStarts:
         assert recorder.sample()["time"][:, 0].unique().tolist() == [0]
 
 
-@pytest.mark.parametrize("sampling", ["steps", "episodes", "episode_starts"])
+@pytest.mark.parametrize("sampling", [*PADDED, "episode_starts"])
 def test_a_memory_that_was_sampled_forgets_what_it_knew_when_another_is_loaded(sampling):
     settings = {"slice_len": 4, "batch_size": 64, "num_envs": 2, "sampling": sampling}
     source, target = (make_sequence_buffer(40, **settings) for _ in range(2))

@@ -26,6 +26,9 @@ DEFAULTS = {
     "all_subgoals": True,
     "intra_option": True,
     "max_meta_target": None,
+    "burn_in": 0.0,
+    "train_exact_states": True,
+    "loss_function": "l2",
 }
 # Where each argument changes the loss on the random sequences below.
 CHANGES = [
@@ -43,6 +46,8 @@ CHANGES = [
     {"intra_option": False, "trace_decay": 0.0},
     {"intra_option": False, "double": False},
     {"max_meta_target": 0.4},
+    {"burn_in": 0.5, "train_exact_states": False},
+    {"loss_function": "smooth_l1"},
 ]
 
 
@@ -123,6 +128,21 @@ def _play_row(action_value, first, chance, choice):
     return row
 
 
+def start_in_mid_episode(td):
+    """The first episode of every other sequence began earlier."""
+    td["is_init"][::2, 0] = False
+    return td
+
+
+def pad(td, seed=0):
+    """Cuts sequences off after 1 to T steps; what is left repeats the last step, as the replay memory has it."""
+    lengths = torch.randint(1, T + 1, (B,), generator=torch.Generator().manual_seed(seed))
+    lengths[0], lengths[1] = T, T - 1
+    padded = td[torch.arange(B)[:, None], torch.arange(T).expand(B, T).minimum(lengths[:, None] - 1)].contiguous()
+    padded["collector", "mask"] = torch.arange(T) < lengths[:, None]
+    return padded
+
+
 class Reference:
     """The equations of the module's docstring, step by step and subgoal by subgoal."""
 
@@ -132,6 +152,9 @@ class Reference:
         self.rows, self.steps, self.subgoals = td["subgoal_mask"].shape
         self.action = td["action"].tolist()
         self.left, self.starts = td["subgoal_mask"].tolist(), td["option_init"].squeeze(-1).tolist()
+        self.init = td["is_init"].squeeze(-1).tolist()
+        mask = td.get(("collector", "mask"), torch.ones(self.rows, self.steps, dtype=torch.bool))
+        self.length = mask.sum(1).tolist()
         after = td["next"]
         self.attained, self.subgoal = after["attained"].tolist(), after["active_subgoal"].tolist()
         names = ("hazard", "done", "terminated", "extrinsic_reward")
@@ -141,6 +164,9 @@ class Reference:
         """Errors of all trained entries by (row, time, subgoal), of the sub level and of the meta level."""
         sub, meta = {}, {}
         for b, t, g in product(range(self.rows), range(self.steps - 1), range(self.subgoals)):
+            exact = self.s.train_exact_states and any(self.init[b][: t + 1])
+            if (t < int((self.steps - 1) * self.s.burn_in) and not exact) or t >= self.length[b]:
+                continue
             if self.trains_sub(b, t, g):
                 target = min(self.sub_target(b, t, g), self.s.reached_reward)
                 sub[b, t, g] = self.q[b][t][g][self.action[b][t]] - target
@@ -152,7 +178,7 @@ class Reference:
         return sub, meta
 
     def cut_off(self, b, t):
-        return self.done[b][t] and not self.terminated[b][t]
+        return (self.done[b][t] or t == self.length[b] - 1) and not self.terminated[b][t]
 
     def greedy(self, b, t, g):
         values = self.q[b][t][g]
@@ -231,27 +257,42 @@ def mean_square(errors):
     return sum(error**2 for error in errors.values()) / len(errors)
 
 
+def mean_loss(errors, loss_function="l2"):
+    if loss_function == "l2":
+        return mean_square(errors)
+    huber = [error**2 / 2 if abs(error) < 1 else abs(error) - 0.5 for error in errors.values()]
+    return sum(huber) / len(huber)
+
+
+def slope(error, loss_function="l2"):
+    """Derivative of one entry's loss by its value."""
+    return 2 * error if loss_function == "l2" else max(-1.0, min(1.0, error))
+
+
 class TestAgainstPlainLoops:
+    @pytest.mark.parametrize("change", [None, pad, start_in_mid_episode])
     @pytest.mark.parametrize("seed", [0, 1])
-    @pytest.mark.parametrize("settings", [{}, *CHANGES], ids=str)
-    def test_losses_targets_and_masks(self, settings, seed):
+    @pytest.mark.parametrize("settings", [{}, {"burn_in": 0.5}, *CHANGES], ids=str)
+    def test_losses_targets_and_masks(self, settings, seed, change):
         """A table's gradient at an entry is 2 (value - target) / count where it is trained, and 0 elsewhere."""
         torch.manual_seed(seed)
         loss = make_loss(**settings)
         td = play(loss, seed)
+        td = td if change is None else change(td)
         result = loss(td.clone())
         result["loss"].backward()
         sub, meta = Reference(in_sequences(loss), td, **settings).run()
-        assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-5)
-        assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-5)
-        assert result["loss"].item() == pytest.approx(mean_square(sub) + mean_square(meta), rel=1e-5)
+        function = settings.get("loss_function", "l2")
+        wanted = [mean_loss(errors, function) for errors in (sub, meta)]
+        assert [result["sub_loss"].item(), result["meta_loss"].item()] == pytest.approx(wanted, rel=1e-5)
+        assert result["loss"].item() == pytest.approx(sum(wanted), rel=1e-5)
 
         action_value, subgoal_value, *_ = tables(loss)
         expected_sub, expected_meta = torch.zeros_like(action_value), torch.zeros_like(subgoal_value)
         for (b, t, g), error in sub.items():
-            expected_sub[b * T + t, g, td["action"][b, t]] = 2 * error / len(sub)
+            expected_sub[b * T + t, g, td["action"][b, t]] = slope(error, function) / len(sub)
         for (b, t, g), error in meta.items():
-            expected_meta[b * T + t, g] = 2 * error / len(meta)
+            expected_meta[b * T + t, g] = slope(error, function) / len(meta)
         torch.testing.assert_close(action_value.grad, expected_sub, rtol=1e-4, atol=1e-7)
         torch.testing.assert_close(subgoal_value.grad, expected_meta, rtol=1e-4, atol=1e-7)
 
@@ -353,9 +394,39 @@ def test_targets_by_hand(actions, events, sub, meta):
     check_gradient(subgoal_value.grad.sum(1), [0.0] * 4, meta)
 
 
+@pytest.mark.parametrize(
+    ("real", "events", "sub", "meta"),
+    [
+        # As above, for the steps that are real; what the last one led to is not in the sequence.
+        (3, {}, [0.3, 0.4, None], [1.5, 2.0, None]),
+        (3, {"done": 2, "terminated": 2}, [0.25, 0.2, 0.0], [1.25, 1.0, 0.0]),
+        (3, {"attained": 2}, [0.3125, 0.45, 1.0], [1.5, 2.0, None]),
+        (2, END, [0.2, 0.0], [1.0, 0.0]),
+        (2, {"done": 1}, [0.4, None], [2.0, None]),
+        (2, {"hazard": 0}, [-0.6, None], [2.0, None]),
+        (1, {}, [None], [None]),
+        (1, {"done": 0, "terminated": 0, "attained": 0}, [1.0], [0.0]),
+    ],
+)
+def test_targets_of_padded_sequences_by_hand(real, events, sub, meta):
+    loss = make_loss(4, subgoals=1, actions=2, sub_gamma=0.5, meta_gamma=0.5, trace_decay=0.5)
+    with torch.no_grad():
+        for table, value in zip(tables(loss), ([1.0, 0.0], [0.0], [0.8, 8.0], [4.0]), strict=True):
+            table.copy_(torch.tensor(value).expand_as(table))
+    td = hand_made("0000", **events)
+    td = td[:, torch.arange(4).clamp(max=real - 1)].contiguous()
+    td["collector", "mask"] = (torch.arange(4) < real)[None]
+    td["observation"] = torch.arange(4)[None]  # entries of their own, so that padding shows if it is trained
+    loss(td)["loss"].backward()
+    action_value, subgoal_value, *_ = tables(loss)
+    nothing = [None] * (3 - real)
+    check_gradient(action_value.grad.sum((1, 2)), [1.0] * 4, sub + nothing)
+    check_gradient(subgoal_value.grad.sum(1), [0.0] * 4, meta + nothing)
+
+
 def check_gradient(grad, values, targets):
     """2 (value - target) / count where there is a target, else 0; 0 for the lookahead."""
-    count = sum(target is not None for target in targets)
+    count = max(1, sum(target is not None for target in targets))
     errors = [0.0 if y is None else value - y for value, y in zip(values, targets, strict=False)]
     assert grad.tolist() == pytest.approx([2 * error / count for error in errors] + [0.0], abs=1e-6)
 
@@ -363,10 +434,10 @@ def check_gradient(grad, values, targets):
 class TestInTheEnvironment:
     """On sequences that real play left in the memory, with a real network."""
 
-    def sample(self, **options):
+    def sample(self, sampling="episode_starts", **options):
         torch.manual_seed(0)
         env = small_env(8, max_steps=6, view=5)
-        settings = tiny_settings(sampling="episode_starts", slice_len=10, batch_size=32, learning_rate=1e-2)
+        settings = tiny_settings(sampling=sampling, slice_len=10, batch_size=32, learning_rate=1e-2)
         sizes = {"memory_size": 8, "head_size": 8, "prediction_steps": 0}
         algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, **(sizes | options))
         self.learner = algorithm.learners["joint"]
@@ -382,10 +453,12 @@ class TestInTheEnvironment:
         with torch.no_grad():
             return [value for pair in loss._values(td)[:2] for value in pair]
 
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
     @pytest.mark.parametrize("options", [{}, {"max_option_steps": 2, "trace_decay": 1.0}], ids=str)
-    def test_losses(self, options):
-        loss, td = self.sample(**options)
+    def test_losses(self, options, sampling):
+        loss, td = self.sample(sampling, **options)
         result = loss(td)
+        assert (("collector", "mask") in td.keys(True)) == (sampling == "whole_episodes")
         sub, meta = Reference(self.values(loss, td), td, trace_decay=options.get("trace_decay", 0.8)).run()
         assert result["trained_steps"] == len(sub) > 200 and len(meta) > 100
         assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-4)
@@ -422,8 +495,10 @@ class TestInTheEnvironment:
         assert any(name.startswith(("memory", "features")) for name in moved) == joint
         assert {"meta_head.0.weight", "sub_head.2.bias"} <= moved
 
-    def test_predictions_within_an_episode_enter_the_loss_and_train_the_memory(self):
-        loss, td = self.sample(prediction_steps=3, prediction_weight=0.5)
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    def test_predictions_within_an_episode_enter_the_loss_and_train_the_memory(self, sampling):
+        loss, td = self.sample(sampling=sampling, prediction_steps=3, prediction_weight=0.5)
+        valid = loss._valid(td)
         network, seen = self.learner.network.network, set()
         rows, steps = td.shape
         for seed in range(8):
@@ -437,7 +512,7 @@ class TestInTheEnvironment:
             kept = [
                 errors[b, t].item()
                 for b, t in product(range(rows), range(steps - ahead))
-                if not td["is_init"][b, t + 1 : t + ahead + 1].any()
+                if valid[b, t + ahead] and not td["is_init"][b, t + 1 : t + ahead + 1].any()
             ]
             assert 0 < len(kept) < errors.numel()
             assert result["prediction_loss"].item() == pytest.approx(sum(kept) / len(kept), rel=1e-4)
@@ -488,7 +563,7 @@ class TestInTheEnvironment:
             td["next", f"agent_{key}", "x"] = td["next"].pop(key)
         moved = {key: (f"agent_{key}", "x") for key in loss.default_keys.__dataclass_fields__}
         loss.set_keys(**moved)
-        assert len(moved) == 8 and loss(td)["loss"] == expected
+        assert len(moved) == 9 and loss(td)["loss"] == expected
 
 
 def test_everything_stays_on_the_device():
@@ -514,3 +589,15 @@ def test_sequences_without_anything_to_train():
 def test_wrong_values(name, value):
     with pytest.raises(ValueError, match=rf"{name} must lie in \[0, 1\], got {value}; "):
         make_loss(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
+        ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
+    ],
+)
+def test_wrong_values_of_the_loss_function_and_of_what_it_reads(settings, message):
+    with pytest.raises(ValueError, match=message):
+        make_loss(**settings)

@@ -1,0 +1,195 @@
+"""How sequences are drawn from a replay memory: which steps may start one, and how far it goes on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import NestedKey
+from torch import Tensor
+from torchrl.data import SliceSampler, Storage
+
+from hdrqn_torchrl import keys
+
+
+class StepSliceSampler(SliceSampler):
+    """Slices that start at a uniformly random *step*; TorchRL's ``SliceSampler`` picks an episode first.
+
+    How long an episode lasts depends on what happened in it. To pick episodes uniformly shows each step of a
+    short (say, successful) episode more often than it occurs, and shows its last steps less often than those in
+    its middle; Q-values of a stochastic task are then biased. Here whether a step is shown depends on its past
+    only. A slice that meets the end of its episode is padded and ``("collector", "mask")`` tells its real steps.
+
+    Args:
+        slice_len: steps of a slice.
+        traj_key: entry that numbers the episodes.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> sampler = StepSliceSampler(slice_len=4, traj_key="episode")
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=8)
+        >>> _ = buffer.extend(TensorDict(episode=torch.tensor([0, 0, 0, 1, 1]), batch_size=5))
+        >>> buffer.sample().reshape(2, 4)["collector", "mask"].shape
+        torch.Size([2, 4])
+    """
+
+    def __init__(self, *, slice_len: int, traj_key: NestedKey = keys.TRAJ_IDS) -> None:
+        super().__init__(
+            slice_len=slice_len,
+            traj_key=traj_key,
+            truncated_key=None,
+            init_key=None,
+            cache_values=True,
+            strict_length=False,
+            pad_output=True,
+        )
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
+        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
+        length, count = self._adjusted_batch_size(batch_size)
+        ends = lengths.cumsum(0)
+        step = torch.randint(int(ends[-1]), (count,), device=ends.device, generator=self._rng)
+        episode = torch.searchsorted(ends, step, right=True)
+        left = ends[episode] - step  # real steps from the start of the slice on
+        start = first[episode]
+        start[:, 0] += lengths[episode] - left
+        return padded_slices(start, left, length, rows=storage.shape[0])
+
+
+class WholeEpisodeSampler(StepSliceSampler):
+    """Slices that start where a random episode starts, padded after its end.
+
+    Like :class:`EpisodeStartSampler` where the recurrent state of every step is exact; here each slice shows one
+    episode, so that short episodes leave room unused, and storages of one dimension (options) will do, too.
+
+    Args:
+        slice_len: steps of a slice; an episode's later steps are never shown.
+        init_key: first step of an episode.
+        traj_key: entry that numbers the episodes.
+    """
+
+    def __init__(
+        self, *, slice_len: int, init_key: NestedKey = keys.IS_INIT, traj_key: NestedKey = keys.TRAJ_IDS
+    ) -> None:
+        super().__init__(slice_len=slice_len, traj_key=traj_key)
+        self.first_key = init_key
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
+        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
+        length, count = self._adjusted_batch_size(batch_size)
+        whole = storage[:].get(self.first_key)[first.unbind(-1)].flatten().nonzero().squeeze(-1)
+        if not len(whole):  # the ring wrote over the beginning of every episode
+            raise RuntimeError("no stored episode has its first step; raise capacity above the length of an episode.")
+        chosen = whole[torch.randint(len(whole), (count,), device=whole.device, generator=self._rng)]
+        return padded_slices(first[chosen], lengths[chosen], length, rows=storage.shape[0])
+
+
+class EpisodeStartSampler(SliceSampler):
+    """Slices that start where a random episode starts, and run on into the next ones if it is shorter.
+
+    The recurrent state of every step is exact, no step is padding, and whether a step is shown depends on its past only
+    (see :class:`StepSliceSampler`). Needs a storage of two dimensions (time, environment).
+
+    Args:
+        slice_len: steps of a slice; an episode's later steps are never shown.
+        init_key: first step of an episode.
+        traj_key: entry that numbers the episodes.
+        done_key: last step of an episode.
+    """
+
+    def __init__(
+        self,
+        *,
+        slice_len: int,
+        init_key: NestedKey = keys.IS_INIT,
+        traj_key: NestedKey = keys.TRAJ_IDS,
+        done_key: NestedKey = ("next", keys.DONE),
+    ) -> None:
+        super().__init__(slice_len=slice_len, traj_key=traj_key, truncated_key=None, init_key=None, cache_values=True)
+        self.first_key, self.done_key = init_key, done_key
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
+        length, count = self._adjusted_batch_size(batch_size)
+        contents = storage._mutation_revision
+        if contents not in self._cache:
+            self._cache.clear()
+            self._cache[contents] = self._find_starts(storage, length)
+        time, environment = self._cache[contents]
+        if not len(time):
+            raise RuntimeError(
+                f"no stored start of an episode begins slice_len={length} stored steps; update later, raise capacity "
+                "or use shorter slices."
+            )
+        chosen = torch.randint(len(time), (count,), device=time.device, generator=self._rng)
+        times = time[chosen].unsqueeze(-1) + torch.arange(length, device=time.device)
+        return ((times % storage.shape[0]).flatten(), environment[chosen].repeat_interleave(length)), {}
+
+    def _find_starts(self, storage: Storage, length: int) -> tuple[Tensor, Tensor]:
+        steps = storage[:].select(self.first_key, self.traj_key, self.done_key)
+        init, episode, done = (steps.get(key) for key in (self.first_key, self.traj_key, self.done_key))
+        starts = episode_starts(init.squeeze(-1), episode, done.squeeze(-1), storage._last_cursor_index, length)
+        return starts.nonzero(as_tuple=True)  # type: ignore[return-value]
+
+
+def episode_starts(init: Tensor, episode: Tensor, done: Tensor, newest: int, length: int) -> Tensor:
+    """Which steps of a ring start an episode and are followed by ``length - 1`` steps without a gap.
+
+    Args:
+        init: first step of an episode, ``[rows, N]`` bool.
+        episode: number of the episode, ``[rows, N]``.
+        done: last step of an episode, ``[rows, N]`` bool.
+        newest: row that was written last.
+        length: steps of a slice.
+
+    Returns:
+        ``[rows, N]`` bool.
+
+    Examples:
+        >>> done = torch.tensor([[False], [True], [False], [False]])
+        >>> init, episode = done.roll(1, 0), torch.tensor([[0], [0], [1], [1]])
+        >>> episode_starts(init, episode, done, newest=3, length=2).flatten()
+        tensor([False, False,  True, False])
+    """
+    age = (newest - torch.arange(len(init), device=init.device)) % len(init)
+    starts = init & (age >= length - 1).unsqueeze(-1)
+    # Where one episode follows another that has not ended, steps between them were lost.
+    gap = ((episode != episode.roll(-1, 0)) | init.roll(-1, 0)) & ~done
+    gap[newest] = False
+    if length > 1 and gap.any():
+        spoilt = gap
+        for _ in range(length - 2):
+            spoilt = gap | spoilt.roll(-1, 0)
+        starts &= ~spoilt
+    return starts
+
+
+def padded_slices(
+    start: Tensor, left: Tensor, length: int, *, rows: int
+) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+    """Slices of a ring that repeat their last real step where they end early.
+
+    Args:
+        start: place of each slice's first step: time, then environment if there are several, ``[B, ndim]``.
+        left: real steps from there on, ``[B]``.
+        length: steps of a slice.
+        rows: times that the ring holds.
+
+    Returns:
+        Indices ``[B * length]``, one tensor per dimension, and which of them are real, under
+        ``("collector", "mask")``.
+
+    Examples:
+        >>> (time,), info = padded_slices(torch.tensor([[4], [0]]), torch.tensor([3, 2]), 3, rows=6)
+        >>> time.tolist(), info["collector", "mask"].tolist()
+        ([4, 5, 0, 0, 1, 1], [True, True, True, True, True, False])
+    """
+    offset = torch.arange(length, device=start.device)
+    mask = offset < left.unsqueeze(-1)  # [B, T]
+    time = start[:, :1] + torch.minimum(offset, left.unsqueeze(-1) - 1)
+    index = [(time % rows).flatten()]
+    index += [place.repeat_interleave(length) for place in start[:, 1:].unbind(-1)]
+    return tuple(index), {keys.PAD_MASK: mask.flatten()}
