@@ -291,7 +291,8 @@ def make_v3(
         max_option_steps: step limit of an option.
 
     Raises:
-        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty.
+        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty; or if
+            ``learner`` has targets of its own (``trace_decay``, ``n_step``).
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -303,6 +304,11 @@ def make_v3(
         raise ValueError(
             f"sampling must be 'episode_starts' for v3, got {learner.sampling!r}: its memory lasts a whole episode and "
             "would start empty in the middle of one."
+        )
+    if learner.trace_decay or learner.n_step > 1:
+        raise ValueError(
+            f"learner.trace_decay and n_step must be left at 0 and 1 for v3, got {learner.trace_decay} and "
+            f"{learner.n_step}; its loss has a trace_decay of its own, an argument of v3."
         )
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
     network = AllSubgoalsNetwork(

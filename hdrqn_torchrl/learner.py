@@ -13,7 +13,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import Sampling, make_sequence_buffer, sample_sequences
-from hdrqn_torchrl.objectives import RecurrentDQNLoss
+from hdrqn_torchrl.objectives import RecurrentDQNLoss, check_returns
 
 
 class NonFiniteError(ArithmeticError):
@@ -54,6 +54,8 @@ class LearnerSettings:
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be, if known; targets are cut off above it.
+        trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
+        n_step: rewards of a target; 1: one-step targets.
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -75,8 +77,11 @@ class LearnerSettings:
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
     max_target: float | None = None
+    trace_decay: float = 0.0
+    n_step: int = 1
 
     def __post_init__(self) -> None:
+        check_returns(self.trace_decay, self.n_step)
         rules = (
             ("slice_len", self.slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
             ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
@@ -93,6 +98,18 @@ class LearnerSettings:
             ("learning_rate_frames", self.learning_rate_frames >= 1, ">= 1", "use the frames of the whole training"),
             ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
+            (
+                "n_step",
+                self.n_step <= self.slice_len,
+                "<= slice_len",
+                "no sequence holds so many rewards; raise slice_len",
+            ),
+            (
+                "slice_len",
+                not self.trace_decay or self.slice_len > 1,
+                "> 1 where trace_decay > 0",
+                "a sequence of one transition has no next target to take over",
+            ),
         )
         for name, holds, rule, remedy in rules:
             if not holds:
@@ -253,6 +270,8 @@ def _recurrent_loss(
         loss_function=settings.loss_function,
         double=settings.double,
         max_target=settings.max_target,
+        trace_decay=settings.trace_decay,
+        n_step=settings.n_step,
     )
     loss.set_keys(**loss_keys)
     return loss
