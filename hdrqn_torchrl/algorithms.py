@@ -85,6 +85,8 @@ def make_recurrent_loss(
         loss_function=settings.loss_function,
         double=settings.double,
         max_target=settings.max_target,
+        trace_decay=settings.trace_decay,
+        n_step=settings.n_step,
     )
     loss.set_keys(**(loss_keys or {}))
     return loss
@@ -333,8 +335,8 @@ def make_v3(
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
 
     Raises:
-        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty; if
-            ``learner.max_target`` is given.
+        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty; or if
+            ``learner`` has targets of its own (``max_target``, ``trace_decay``, ``n_step``).
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -346,6 +348,11 @@ def make_v3(
         raise ValueError(
             f"sampling must be one of {FROM_STARTS} for v3, got {learner.sampling!r}: its memory lasts a whole episode "
             "and would start empty in the middle of one."
+        )
+    if learner.trace_decay or learner.n_step > 1:
+        raise ValueError(
+            f"learner.trace_decay and n_step must be left at 0 and 1 for v3, got {learner.trace_decay} and "
+            f"{learner.n_step}; its loss has a trace_decay of its own, an argument of v3."
         )
     if learner.max_target is not None:
         raise ValueError(

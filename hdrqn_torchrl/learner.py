@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.objectives import check_returns
 
 
 class NonFiniteError(ArithmeticError):
@@ -56,6 +57,8 @@ class LearnerSettings:
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be, if known; targets are cut off above it.
+        trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
+        n_step: rewards of a target; 1: one-step targets.
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -77,8 +80,11 @@ class LearnerSettings:
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
     max_target: float | None = None
+    trace_decay: float = 0.0
+    n_step: int = 1
 
     def __post_init__(self) -> None:
+        check_returns(self.trace_decay, self.n_step)
         rules = (
             ("slice_len", self.slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
             ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
@@ -101,6 +107,18 @@ class LearnerSettings:
                 "the first steps of an episode would never be trained; or use burn_in=0",
             ),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
+            (
+                "n_step",
+                self.n_step <= self.slice_len,
+                "<= slice_len",
+                "no sequence holds so many rewards; raise slice_len",
+            ),
+            (
+                "slice_len",
+                not self.trace_decay or self.slice_len > 1,
+                "> 1 where trace_decay > 0",
+                "a sequence of one transition has no next target to take over",
+            ),
         )
         for name, holds, rule, remedy in rules:
             if not holds:

@@ -91,6 +91,18 @@ class TestOptions:
         returns, steps = batch["next", "option_return"], batch["next", "option_steps"]
         assert ((returns * 100).round() == returns * 100).all() and (returns[steps > 1] >= 1.0).any()
 
+    @pytest.mark.parametrize(("name", "levels"), [("dqn", 1), ("drqn", 1), ("hdqn", 2), ("v1", 2), ("v2", 2)])
+    @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
+    def test_longer_targets_at_every_level(self, name, levels, settings):
+        algorithm, batch = self.steps(name=name, settings=tiny_settings(batch_size=64, **settings))
+        default, _ = self.steps(name=name)
+        assert len(algorithm.learners) == levels
+        for level, learner in algorithm.learners.items():
+            learner.store(batch)
+            sample = learner.sample()
+            changed, usual = learner.loss(sample), default.learners[level].loss(sample)
+            assert changed["q_value"] == usual["q_value"] and changed["target"] != usual["target"]
+
     @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
     def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):
         algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount)
@@ -412,6 +424,13 @@ class TestV3:
     def test_one_bound_for_both_levels_is_refused(self):
         with pytest.raises(ValueError, match=r"max_target must be None for v3, got 1.0; .* by max_meta_target"):
             self.make(learner={"max_target": 1.0})
+
+    @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
+    def test_targets_of_the_learner_are_refused(self, settings):
+        with pytest.raises(
+            ValueError, match=r"trace_decay and n_step must be left at 0 and 1 for v3, got .*; its loss"
+        ):
+            self.make(learner=settings)
 
     def test_the_default_learner(self):
         assert V3_LEARNER.sampling == "episode_starts"

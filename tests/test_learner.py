@@ -239,6 +239,8 @@ class TestSettings:
             {"max_grad_norm": 1e-3},
             {"tau": 0.5},
             {"max_target": 0.1},
+            {"trace_decay": 0.5},
+            {"n_step": 2},
         ],
         ids=str,
     )
@@ -254,6 +256,20 @@ class TestSettings:
             changed.update(sample.clone())
         params = [learner.loss.value_network_params.data for learner in (default, changed)]
         assert parameter_distance(*params) > 1e-7
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"trace_decay": -0.1}, r"trace_decay must lie in \[0, 1\], got -0.1; "),
+            ({"n_step": 0}, "n_step must be >= 1, got 0; "),
+            ({"n_step": 3, "trace_decay": 0.5}, "n_step must be 1 where trace_decay > 0, got n_step=3 and .*=0.5; "),
+            ({"n_step": 5}, "n_step must be <= slice_len, got 5; no sequence holds so many rewards"),
+            ({"trace_decay": 0.5, "slice_len": 1}, "slice_len must be > 1 where trace_decay > 0, got 1; "),
+        ],
+    )
+    def test_lengths_of_targets_that_contradict_each_other(self, changes, message):
+        with pytest.raises(ValueError, match=message):
+            tiny_settings(**changes)
 
     def test_sampling_reaches_the_memory(self):
         samplers = {type(make_learner(sampling=kind).buffer.sampler) for kind in ("steps", "episodes")}

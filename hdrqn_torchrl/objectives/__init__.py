@@ -3,7 +3,9 @@
 from hdrqn_torchrl.objectives.all_subgoals import AllSubgoalsLoss
 from hdrqn_torchrl.objectives.recurrent_dqn import RecurrentDQNLoss
 from hdrqn_torchrl.objectives.targets import (
+    check_returns,
     double_q_value,
+    greedy_choice,
     lambda_returns,
     n_step_returns,
     smdp_target,
@@ -14,7 +16,9 @@ from hdrqn_torchrl.objectives.targets import (
 __all__ = [
     "AllSubgoalsLoss",
     "RecurrentDQNLoss",
+    "check_returns",
     "double_q_value",
+    "greedy_choice",
     "lambda_returns",
     "n_step_returns",
     "smdp_target",

@@ -16,7 +16,16 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.objectives.targets import double_q_value, smdp_target, training_mask
+from hdrqn_torchrl.objectives.targets import (
+    check_returns,
+    double_q_value,
+    greedy_choice,
+    lambda_returns,
+    n_step_returns,
+    smdp_target,
+    training_mask,
+    watkins_trace,
+)
 
 
 class RecurrentDQNLoss(LossModule):
@@ -33,6 +42,8 @@ class RecurrentDQNLoss(LossModule):
     - Padding (``mask``) contributes nothing; even NaN in it reaches no gradient.
     - Where a segment ends inside a sequence without being terminated (an option's time limit), the input that
       follows belongs to the next segment; such a step is left out unless it is the last one of its sequence.
+    - Longer targets (``trace_decay``, ``n_step``) go on as long as the sequence and its segment do; behind that, the
+      value stands in. Steps that are left out of the loss lend nothing to others.
 
     Args:
         value_network: in recurrent mode reads its ``in_keys`` ``[B, T + 1, ...]`` and writes ``action_value``
@@ -47,11 +58,16 @@ class RecurrentDQNLoss(LossModule):
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
         max_target: targets are cut off above this value: the largest return there can be, where it is known. It
             stops the overestimation that bootstrapping builds up while rewards are still rare.
+        trace_decay: lambda of Watkins' Q(lambda): a target takes over this share of the next step's own target, if
+            the next action is the main network's greedy one. 0 is the one-step target.
+        n_step: rewards before the value; 1 is the one-step target. Later actions are taken as they came, exploratory
+            or not, as in Rainbow (Hessel et al., 2018) and R2D2: some bias for faster news.
         delay_value: whether a target network is kept (update it with TorchRL's ``SoftUpdate`` or ``HardUpdate``).
 
     Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
     ``steps`` (under ``"next"``, ``None``: 1); ``init`` (restart of the state); ``mask`` (padding);
-    ``action_mask`` (choices that exist, ``None``: all).
+    ``action_mask`` (choices that exist, ``None``: all); ``eligible`` (steps that may enter the loss, ``None``: all;
+    unlike padding they are read, and may lie anywhere).
 
     Returns (``forward``): ``loss`` (scalar), and without gradient ``td_error`` (mean absolute), ``q_value`` and
     ``target`` (means), ``trained_steps`` (how many steps entered the loss).
@@ -79,6 +95,7 @@ class RecurrentDQNLoss(LossModule):
         init: NestedKey = keys.IS_INIT
         mask: NestedKey = keys.PAD_MASK
         action_mask: NestedKey | None = None
+        eligible: NestedKey | None = None
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -99,6 +116,8 @@ class RecurrentDQNLoss(LossModule):
         double: bool = True,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
         max_target: float | None = None,
+        trace_decay: float = 0.0,
+        n_step: int = 1,
         delay_value: bool = True,
     ) -> None:
         if not 0.0 <= gamma <= 1.0:
@@ -107,6 +126,7 @@ class RecurrentDQNLoss(LossModule):
             raise ValueError(f"burn_in must lie in [0, 1), got {burn_in}; the paper's last-half rule is 0.5.")
         if loss_function not in ("l2", "smooth_l1"):
             raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the paper uses 'l2'.")
+        check_returns(trace_decay, n_step)
         super().__init__()
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
         # Both networks as they are called, outside the module tree: their parameters are those registered above.
@@ -119,6 +139,7 @@ class RecurrentDQNLoss(LossModule):
         self.register_buffer("gamma", torch.tensor(gamma))
         self.burn_in, self.train_exact_states = burn_in, train_exact_states
         self.double, self.loss_function, self.max_target = double, loss_function, max_target
+        self.trace_decay, self.n_step = trace_decay, n_step
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -136,7 +157,8 @@ class RecurrentDQNLoss(LossModule):
         k = self.tensor_keys
         nexts = [k.reward, k.done, k.terminated, *([] if k.steps is None else [k.steps]), *self._input_keys]
         masks = [] if k.action_mask is None else [k.action_mask]
-        return [k.action, k.init, *self._input_keys, *masks, *(unravel_key(("next", key)) for key in nexts + masks)]
+        flags = [k.init] if k.eligible is None else [k.init, k.eligible]
+        return [k.action, *flags, *self._input_keys, *masks, *(unravel_key(("next", key)) for key in nexts + masks)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         k, after = self.tensor_keys, tensordict["next"]
@@ -150,16 +172,31 @@ class RecurrentDQNLoss(LossModule):
         online, target = self._action_values(inputs)
         chosen = online[:, :-1].gather(-1, tensordict[k.action].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
-            allowed = None if k.action_mask is None else inputs.get(k.action_mask)[:, 1:]
+            allowed = None if k.action_mask is None else inputs.get(k.action_mask)
             chooser = online.detach() if self.double else target
-            next_value = double_q_value(chooser[:, 1:], target[:, 1:], allowed)
+            next_value = double_q_value(chooser[:, 1:], target[:, 1:], None if allowed is None else allowed[:, 1:])
             steps = None if k.steps is None else _steps_of(after[k.steps], tensordict)
             reward = _steps_of(after[k.reward], tensordict)
-            wanted = smdp_target(reward, terminated, next_value, self.gamma, steps)
+            usable = valid & ~_ends_unseen(done & ~terminated, valid)
+            if k.eligible is not None:
+                usable = usable & _steps_of(tensordict[k.eligible], tensordict)
+            if self.n_step == 1 and not self.trace_decay:
+                wanted = smdp_target(reward, terminated, next_value, self.gamma, steps)
+            else:
+                # A terminated step has no future and a cut one no target, so only the next step need be looked at.
+                follows = (usable & ~init).roll(-1, 1)  # what the last step gets is not read
+                best = greedy_choice(online, allowed)[:, :-1]
+                wanted = self._longer_targets(
+                    reward.masked_fill(~valid, 0.0),
+                    terminated,
+                    next_value,
+                    self.gamma if steps is None else self.gamma**steps,
+                    follows=follows,
+                    greedy=best == tensordict[k.action],
+                )
             if self.max_target is not None:
                 wanted = wanted.clamp(max=self.max_target)
-            trained = training_mask(valid, init, self.burn_in, self.train_exact_states)
-            trained = trained & ~_ends_unseen(done & ~terminated, valid)
+            trained = usable & training_mask(valid, init, self.burn_in, self.train_exact_states)
             count = trained.sum().clamp(min=1)
             wanted = torch.where(trained, wanted, chosen)
         loss = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0).sum() / count
@@ -171,6 +208,15 @@ class RecurrentDQNLoss(LossModule):
                 "trained_steps": trained.sum(),
             }
         return TensorDict({"loss": loss, **report}, [])
+
+    def _longer_targets(
+        self, reward: Tensor, ended: Tensor, next_value: Tensor, discount: Tensor, *, follows: Tensor, greedy: Tensor
+    ) -> Tensor:
+        """Targets ``[B, T]`` that take over the next step's own where that ``follows`` and has one to lend."""
+        if self.n_step > 1:
+            return n_step_returns(reward, ended, next_value, follows, discount, self.n_step)
+        trace = watkins_trace(greedy, self.trace_decay).masked_fill(~follows, 0.0)
+        return lambda_returns(reward, ended, next_value, trace, discount)
 
     def _inputs(self, tensordict: TensorDictBase, valid: Tensor, init: Tensor) -> TensorDictBase:
         """The T + 1 inputs of each sequence: what was seen at each step, then what followed the last valid one."""

@@ -26,8 +26,12 @@ def double_q_value(online: Tensor, target: Tensor, mask: Tensor | None = None) -
         >>> double_q_value(torch.tensor([1.0, 2.0]), torch.tensor([5.0, 3.0]))
         tensor(3.)
     """
-    choice = online if mask is None else mask_values(online, mask)
-    return target.gather(-1, choice.argmax(-1, keepdim=True)).squeeze(-1)
+    return target.gather(-1, greedy_choice(online, mask).unsqueeze(-1)).squeeze(-1)
+
+
+def greedy_choice(value: Tensor, mask: Tensor | None = None) -> Tensor:
+    """The best action ``[*]`` by Q-values ``[*, A]`` among those that exist (``mask``, ``[*, A]`` bool)."""
+    return (value if mask is None else mask_values(value, mask)).argmax(-1)
 
 
 def smdp_target(
@@ -83,6 +87,27 @@ def lambda_returns(
     ):
         now.addcmul_(share, following)
     return target
+
+
+def check_returns(trace_decay: float, n_step: int) -> None:
+    """Refuses lengths of targets that do not exist or contradict each other.
+
+    Args:
+        trace_decay: lambda.
+        n_step: number of rewards.
+
+    Raises:
+        ValueError: if a value breaks its rule.
+    """
+    if not 0.0 <= trace_decay <= 1.0:
+        raise ValueError(f"trace_decay must lie in [0, 1], got {trace_decay}; use 0.8, or 0 for one-step targets.")
+    if n_step < 1:
+        raise ValueError(f"n_step must be >= 1, got {n_step}; 1 is the one-step target.")
+    if n_step > 1 and trace_decay > 0:
+        raise ValueError(
+            f"n_step must be 1 where trace_decay > 0, got n_step={n_step} and trace_decay={trace_decay}; Q(lambda) "
+            "weighs targets of all lengths already: leave one of the two at its default."
+        )
 
 
 def watkins_trace(greedy: Tensor, trace_decay: float) -> Tensor:

@@ -1,4 +1,5 @@
 from copy import deepcopy
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -103,7 +104,7 @@ def make_sample(seed=0, *, padded=True):
     return sample
 
 
-def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, double=True, huber=False, limit=None):
+def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, huber=False, limit=None, **targets):
     """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps."""
     keys = {"action": "action", "reward": "reward", "done": "done", "terminated": "terminated", "init": "is_init"}
     keys |= {"flat": {}, "sub": SUB_KEYS, "meta": META_KEYS}[level]
@@ -117,23 +118,49 @@ def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, d
         q = unroll_by_steps(network, stream, subgoal, init)[0]
         with torch.no_grad():
             target_q = unroll_by_steps(target_network, stream, subgoal, init)[0]
+        done, terminated = after[keys["done"]][b, :length, 0], after[keys["terminated"]][b, :length, 0]
+        masks = torch.ones(length + 1, ACTIONS, dtype=torch.bool)
+        if "action_mask" in keys:
+            masks = torch.cat([sample["subgoal_mask"][b, :1], after["subgoal_mask"][b, :length]])
+        row = SimpleNamespace(
+            reward=after[keys["reward"]][b, :, 0],
+            terminated=terminated.tolist(),
+            done=done.tolist(),
+            cut=[t for t in range(length - 1) if done[t] and not terminated[t]],
+            discount=[gamma ** (after["option_steps"][b, t].item() if "steps" in keys else 1) for t in range(length)],
+            action=sample[keys["action"]][b].tolist(),
+            masks=masks,
+            q=q.detach(),
+            target_q=target_q,
+        )
         for t in range(length):
             is_exact = exact and bool(init[0, : t + 1].any())
-            done, terminated = after[keys["done"]][b, t].item(), after[keys["terminated"]][b, t].item()
-            if (t < int(TIME * burn_in) and not is_exact) or (done and not terminated and t < length - 1):
+            if (t < int(TIME * burn_in) and not is_exact) or t in row.cut:
                 continue
-            allowed = [True] * ACTIONS
-            if "action_mask" in keys and after["subgoal_mask"][b, t].any():
-                allowed = after["subgoal_mask"][b, t].tolist()
-            chooser = (q if double else target_q)[t + 1].tolist()
-            best = max((a for a in range(ACTIONS) if allowed[a]), key=lambda a: chooser[a])
-            steps = after["option_steps"][b, t].item() if "steps" in keys else 1
-            y = after[keys["reward"]][b, t, 0] + (0.0 if terminated else gamma**steps * target_q[t + 1, best])
+            y = target(row, t, **targets)
             y = y if limit is None else min(y, torch.tensor(limit))
-            prediction = q[t, sample[keys["action"]][b, t]]
+            prediction = q[t, row.action[t]]
             total = total + (functional.smooth_l1_loss(prediction, y) if huber else (prediction - y) ** 2)
             count += 1
     return total / count, count
+
+
+def target(row, t, *, double=True, decay=0.0, n=1):
+    """The target of step ``t`` of one sequence."""
+    if row.terminated[t]:
+        return row.reward[t]
+    value = row.target_q[t + 1, best_of((row.q if double else row.target_q)[t + 1], row.masks[t + 1])]
+    if t + 1 < len(row.done) and not row.done[t] and t + 1 not in row.cut:
+        if n > 1:
+            value = target(row, t + 1, double=double, n=n - 1)
+        elif decay and row.action[t + 1] == best_of(row.q[t + 1], row.masks[t + 1]):
+            value = (1 - decay) * value + decay * target(row, t + 1, double=double, decay=decay)
+    return row.reward[t] + row.discount[t] * value
+
+
+def best_of(values, mask):
+    allowed = [action for action in range(ACTIONS) if mask[action] or not mask.any()]
+    return max(allowed, key=lambda action: values[action])
 
 
 class TestAgainstPlainLoops:
@@ -151,6 +178,10 @@ class TestAgainstPlainLoops:
             {"gamma": 1.0},
             {"max_target": 0.2},
             {"recurrent": False},
+            {"trace_decay": 0.75},
+            {"trace_decay": 0.75, "double": False, "burn_in": 0.0, "max_target": 0.2},
+            {"n_step": 3},
+            {"n_step": 2, "recurrent": False, "burn_in": 0.0},
         ],
         ids=str,
     )
@@ -168,6 +199,8 @@ class TestAgainstPlainLoops:
             double=settings.get("double", True),
             huber="loss_function" in settings,
             limit=settings.get("max_target"),
+            decay=settings.get("trace_decay", 0.0),
+            n=settings.get("n_step", 1),
         )
         assert result["trained_steps"].item() == count
         torch.testing.assert_close(result["loss"], wanted)
@@ -276,9 +309,10 @@ class TestShortSequences:
 
 
 class TestNaN:
+    @pytest.mark.parametrize("settings", [{}, {"trace_decay": 0.5}, {"n_step": 2}], ids=str)
     @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
-    def test_nan_in_the_padding_reaches_neither_loss_nor_gradient(self, level):
-        loss, network = make_loss(level)
+    def test_nan_in_the_padding_reaches_neither_loss_nor_gradient(self, level, settings):
+        loss, network = make_loss(level, **settings)
         sample = make_sample()
         clean = loss(sample)["loss"]
         wanted = torch.autograd.grad(clean, list(network.parameters()))
@@ -487,6 +521,9 @@ class TestKeys:
             ({"gamma": 1.1}, r"gamma must lie in \[0, 1\], got 1.1; "),
             ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
             ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
+            ({"trace_decay": 1.1}, r"trace_decay must lie in \[0, 1\], got 1.1; "),
+            ({"n_step": 0}, "n_step must be >= 1, got 0; "),
+            ({"n_step": 2, "trace_decay": 0.5}, "n_step must be 1 where trace_decay > 0, got n_step=2 and .*0.5; "),
         ],
     )
     def test_wrong_values(self, settings, message):
