@@ -33,6 +33,8 @@ from hdrqn_torchrl.modules import (
 from hdrqn_torchrl.objectives import AllSubgoalsLoss, RecurrentDQNLoss
 from hdrqn_torchrl.transforms import SubgoalTransform
 
+Controller = SubController | MetaController | AllSubgoalsPolicy
+
 V3_LEARNER = LearnerSettings(
     slice_len=50,
     capacity=200_000,
@@ -60,8 +62,19 @@ class Algorithm:
         return TransformedEnv(env, self.make_transforms())
 
 
+def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:
+    """The recurrent states that are stored with the steps: all or none.
+
+    Raises:
+        ValueError: if ``settings.stored_state`` is asked of a network without memory.
+    """
+    if settings.stored_state and not network.state_keys:
+        raise ValueError("stored_state must be False without recurrence, got True; such a network has no state.")
+    return network.state_keys if settings.stored_state else []
+
+
 def make_recurrent_loss(
-    network: TensorDictModuleBase,
+    network: Controller,
     settings: LearnerSettings,
     *,
     gamma: float = 0.99,
@@ -74,6 +87,9 @@ def make_recurrent_loss(
         settings: how it learns.
         gamma: discount of one environment step.
         loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
+
+    Raises:
+        ValueError: if ``settings.stored_state`` is asked of a network without memory.
     """
     loss = RecurrentDQNLoss(
         network,
@@ -83,6 +99,7 @@ def make_recurrent_loss(
         loss_function=settings.loss_function,
         double=settings.double,
         max_target=settings.max_target,
+        state_keys=stored_states(network, settings),
     )
     loss.set_keys(**(loss_keys or {}))
     return loss
@@ -121,7 +138,8 @@ def make_drqn(
         policy,
         learner,
         extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT], next_keys=[keys.OBSERVATION, keys.REWARD]
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
+            next_keys=[keys.OBSERVATION, keys.REWARD],
         ),
         loss=make_recurrent_loss(policy, learner, gamma=gamma),
         num_envs=env.batch_size[0],
@@ -227,7 +245,7 @@ def make_hdrqn(
         sub_controller,
         sub,
         extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT],
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT, *stored_states(sub_controller, sub)],
             next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED],
             subgoal_key=keys.SUBGOAL,
         ),
@@ -251,6 +269,7 @@ def make_hdrqn(
             input_keys=meta_keys,
             mask_key=mask_key,
             at_end=partial(_read_last, sub_controller) if reads_last else None,
+            state_keys=stored_states(meta_controller, meta),
             history=history,
         ),
         loss=make_recurrent_loss(
@@ -316,8 +335,8 @@ def make_v3(
     Args:
         env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
         architecture: where the features come from.
-        learner: how it learns; ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, ``slice_len`` should
-            cover an episode.
+        learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
+            should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
         memory_size: H, size of the LSTM.
         head_size: units of the heads' hidden layers.
@@ -327,8 +346,8 @@ def make_v3(
         max_option_steps: step limit of an option.
 
     Raises:
-        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty; if
-            ``learner.max_target`` is given.
+        ValueError: if ``learner.sampling`` begins in mid-episode without ``stored_state``, where the memory would
+            start empty; if ``learner.max_target`` is given.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -336,10 +355,10 @@ def make_v3(
         >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['joint']
     """
-    if learner.sampling not in FROM_STARTS:
+    if learner.sampling not in FROM_STARTS and not learner.stored_state:
         raise ValueError(
-            f"sampling must be one of {FROM_STARTS} for v3, got {learner.sampling!r}: its memory lasts a whole episode "
-            "and would start empty in the middle of one."
+            f"sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its memory "
+            "lasts a whole episode and would start empty in the middle of one; or use stored_state=True."
         )
     if learner.max_target is not None:
         raise ValueError(
@@ -371,6 +390,7 @@ def make_v3(
         burn_in=learner.burn_in,
         train_exact_states=learner.train_exact_states,
         loss_function=learner.loss_function,
+        stored_state=learner.stored_state,
     )
     stored = StepSelector(
         root_keys=[
@@ -380,6 +400,7 @@ def make_v3(
             keys.IS_INIT,
             keys.OPTION_INIT,
             keys.SUBGOAL_MASK,
+            *stored_states(policy, learner),
         ],
         next_keys=[keys.ATTAINED, keys.HAZARD, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
     )

@@ -38,7 +38,8 @@ class AllSubgoalsLoss(LossModule):
     """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + 1]`` of consecutive steps.
 
     The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
-    on through ends of episodes; each should begin where an episode does, because the memory starts empty. Steps
+    on through ends of episodes; each should begin where an episode does, because the memory starts empty, unless it
+    starts from what was stored (``stored_state``). Steps
     after a sequence's end are padding (``mask``): they contribute nothing, and what the last real step led to is
     unknown unless it ended the episode.
 
@@ -57,6 +58,8 @@ class AllSubgoalsLoss(LossModule):
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
             in sequences that begin where an episode does, every state is exact.
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
+        stored_state: sequences start from the LSTM state that acting had at their first step, in both networks, and
+            from zero where an episode starts.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -111,6 +114,7 @@ class AllSubgoalsLoss(LossModule):
         burn_in: float = 0.0,
         train_exact_states: bool = True,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
+        stored_state: bool = False,
     ) -> None:
         for name, value in (("sub_gamma", sub_gamma), ("meta_gamma", meta_gamma), ("trace_decay", trace_decay)):
             if not 0.0 <= value <= 1.0:
@@ -130,6 +134,7 @@ class AllSubgoalsLoss(LossModule):
         self.hazard_reward, self.double = hazard_reward, double
         self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
         self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
+        self.state_keys = list(policy.state_keys) if stored_state else []
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -138,6 +143,7 @@ class AllSubgoalsLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         policy, k = self._policies[0], self.tensor_keys
         read = [policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key, k.action]
+        read += self.state_keys
         nexts = [k.attained, k.extrinsic_reward, k.done, k.terminated, k.active_subgoal]
         nexts += [k.hazard] if self.hazard_reward else []
         return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
@@ -169,7 +175,8 @@ class AllSubgoalsLoss(LossModule):
     def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network."""
         policy, target_policy = self._policies
-        inputs = tensordict.select(policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
+        read = (policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
+        inputs = tensordict.select(*read, *self.state_keys)
 
         def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor]:
             values = which(inputs.copy())
