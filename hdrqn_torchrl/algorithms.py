@@ -35,6 +35,8 @@ from hdrqn_torchrl.modules import (
 from hdrqn_torchrl.objectives import AllSubgoalsLoss, RecurrentDQNLoss
 from hdrqn_torchrl.transforms import SubgoalTransform
 
+Controller = SubController | MetaController | AllSubgoalsPolicy
+
 V3_LEARNER = LearnerSettings(
     slice_len=50,
     capacity=200_000,
@@ -62,8 +64,19 @@ class Algorithm:
         return TransformedEnv(env, self.make_transforms())
 
 
+def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:
+    """The recurrent states that are stored with the steps: all or none.
+
+    Raises:
+        ValueError: if ``settings.stored_state`` is asked of a network without memory.
+    """
+    if settings.stored_state and not network.state_keys:
+        raise ValueError("stored_state must be False without recurrence, got True; such a network has no state.")
+    return network.state_keys if settings.stored_state else []
+
+
 def make_recurrent_loss(
-    network: TensorDictModuleBase,
+    network: Controller,
     settings: LearnerSettings,
     *,
     gamma: float = 0.99,
@@ -76,6 +89,9 @@ def make_recurrent_loss(
         settings: how it learns.
         gamma: discount of one environment step.
         loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
+
+    Raises:
+        ValueError: if ``settings.stored_state`` is asked of a network without memory.
     """
     loss = RecurrentDQNLoss(
         network,
@@ -87,6 +103,7 @@ def make_recurrent_loss(
         max_target=settings.max_target,
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
+        state_keys=stored_states(network, settings),
     )
     loss.set_keys(**(loss_keys or {}))
     return loss
@@ -125,7 +142,8 @@ def make_drqn(
         policy,
         learner,
         extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT], next_keys=[keys.OBSERVATION, keys.REWARD]
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
+            next_keys=[keys.OBSERVATION, keys.REWARD],
         ),
         loss=make_recurrent_loss(policy, learner, gamma=gamma),
         num_envs=env.batch_size[0],
@@ -231,7 +249,7 @@ def make_hdrqn(
         sub_controller,
         sub,
         extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT],
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT, *stored_states(sub_controller, sub)],
             next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED],
             subgoal_key=keys.SUBGOAL,
         ),
@@ -255,6 +273,7 @@ def make_hdrqn(
             input_keys=meta_keys,
             mask_key=mask_key,
             at_end=partial(_read_last, sub_controller) if reads_last else None,
+            state_keys=stored_states(meta_controller, meta),
             history=history,
         ),
         loss=make_recurrent_loss(
@@ -322,8 +341,8 @@ def make_v3(
     Args:
         env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
         architecture: where the features come from.
-        learner: how it learns; ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, ``slice_len`` should
-            cover an episode.
+        learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
+            should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
         memory_size: H, size of the LSTM.
         head_size: units of the heads' hidden layers.
@@ -335,8 +354,8 @@ def make_v3(
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
 
     Raises:
-        ValueError: if ``learner.sampling`` is another one: in mid-episode the memory would start empty; or if
-            ``learner`` has targets of its own (``max_target``, ``trace_decay``, ``n_step``).
+        ValueError: if ``learner.sampling`` begins in mid-episode without ``stored_state``, where the memory would
+            start empty; or if ``learner`` has targets of its own (``max_target``, ``trace_decay``, ``n_step``).
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -344,10 +363,10 @@ def make_v3(
         >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['joint']
     """
-    if learner.sampling not in FROM_STARTS:
+    if learner.sampling not in FROM_STARTS and not learner.stored_state:
         raise ValueError(
-            f"sampling must be one of {FROM_STARTS} for v3, got {learner.sampling!r}: its memory lasts a whole episode "
-            "and would start empty in the middle of one."
+            f"sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its memory "
+            "lasts a whole episode and would start empty in the middle of one; or use stored_state=True."
         )
     if learner.trace_decay or learner.n_step > 1:
         raise ValueError(
@@ -396,6 +415,7 @@ def make_v3(
         burn_in=learner.burn_in,
         train_exact_states=learner.train_exact_states,
         loss_function=learner.loss_function,
+        stored_state=learner.stored_state,
     )
     stored = StepSelector(
         root_keys=[
@@ -405,6 +425,7 @@ def make_v3(
             keys.IS_INIT,
             keys.OPTION_INIT,
             keys.SUBGOAL_MASK,
+            *stored_states(policy, learner),
         ],
         next_keys=[keys.ATTAINED, keys.HAZARD, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
     )

@@ -36,8 +36,9 @@ class Extract(Protocol):
 class LearnerSettings:
     """How one level learns. The defaults are the paper's where it states them.
 
-    :class:`Learner` reads what concerns drawing and stepping. ``burn_in``, ``train_exact_states``, ``loss_function``,
-    ``double`` and ``max_target`` concern the loss; the builders of :mod:`hdrqn_torchrl.algorithms` pass them on.
+    :class:`Learner` reads what concerns drawing and stepping. ``burn_in``, ``train_exact_states``, ``stored_state``,
+    ``loss_function``, ``double`` and ``max_target`` concern the loss and what is stored for it; the builders of
+    :mod:`hdrqn_torchrl.algorithms` pass them on.
 
     Args:
         slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level).
@@ -50,9 +51,12 @@ class LearnerSettings:
         learning_rate_frames: environment frames that this takes.
         tau: rate of the soft target update.
         max_grad_norm: gradients are clipped to this norm; ``None``: not at all.
-        burn_in: share of a sequence left out of the loss at its beginning.
+        burn_in: share of a sequence left out of the loss at its beginning; its steps only bring the recurrent state up
+            to date. (Gradients flow back through it: what is remembered there is learned, too.)
         train_exact_states: train leading steps whose recurrent state is exact (see
             :func:`~hdrqn_torchrl.objectives.training_mask`).
+        stored_state: store the recurrent state that acting had at each step, and let sequences that begin in
+            mid-episode start from it instead of from zero (R2D2; Kapturowski et al., 2019). Costs 8 H bytes a step.
         sampling: how sequences are drawn (see :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
@@ -76,6 +80,7 @@ class LearnerSettings:
     max_grad_norm: float | None = None
     burn_in: float = 0.5
     train_exact_states: bool = True
+    stored_state: bool = False
     sampling: Sampling = "steps"
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
@@ -105,6 +110,12 @@ class LearnerSettings:
                 self.train_exact_states or not (self.burn_in and self.sampling in FROM_STARTS),
                 f"True with burn_in={self.burn_in} and sampling={self.sampling!r}",
                 "the first steps of an episode would never be trained; or use burn_in=0",
+            ),
+            (
+                "stored_state",
+                not (self.stored_state and self.sampling in FROM_STARTS),
+                f"False with sampling={self.sampling!r}",
+                "all its sequences begin where an episode does, and there the state is zero",
             ),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
             (

@@ -69,7 +69,8 @@ def build(name: str, env: MultiGoalGridEnv, architecture=None, *, settings=None,
     if name == "hdqn":
         return make_hdqn(env, architecture, sub=settings, meta=settings, **options)
     if name == "v3":
-        settings = replace(settings, sampling="episode_starts")
+        if settings.sampling == "steps" and not settings.stored_state:
+            settings = replace(settings, sampling="episode_starts")
         return make_v3(env, architecture, learner=settings, memory_size=8, head_size=8, **options)
     return make_hdrqn(env, architecture, version=name, sub=settings, meta=settings, **options)
 
@@ -201,11 +202,11 @@ def batches_of(steps: TensorDictBase, length: int) -> list[TensorDictBase]:
     return [steps[:, start : start + length] for start in range(0, steps.shape[1] - length + 1, length)]
 
 
-def unroll_by_steps(network, observation, condition=None, init=None):
+def unroll_by_steps(network, observation, condition=None, init=None, first=None):
     """What ``QNetwork.unroll`` computes, as a plain loop over single decisions: ``[B, T, A]``."""
     rows = []
     for b in range(len(observation)):
-        state, values = network.initial_state(1), []
+        state, values = network.initial_state(1) if first is None else [part[b : b + 1] for part in first], []
         for t in range(observation.shape[1]):
             if init is not None and init[b, t]:
                 state = network.initial_state(1)

@@ -286,6 +286,43 @@ def test_a_collector_carries_options_and_states_from_batch_to_batch(name, states
         assert (second[key][:, 0] == first["next", key][:, -1])[going_on].all(), key
 
 
+STATES = {
+    ("drqn", "flat"): ["sub_hidden", "sub_cell"],
+    ("v1", "sub"): ["sub_hidden", "sub_cell"],
+    ("v1", "meta"): ["meta_hidden", "meta_cell"],
+    ("v2", "sub"): ["sub_hidden", "sub_cell"],
+    ("v2", "meta"): ["meta_hidden", "meta_cell"],
+    ("v3", "joint"): ["memory_hidden", "memory_cell"],
+}
+
+
+class TestStoredStates:
+    @pytest.mark.parametrize(("name", "level"), STATES)
+    @pytest.mark.parametrize("stored_state", [False, True])
+    def test_they_are_stored_and_learned_from_only_if_asked_for(self, name, level, stored_state):
+        torch.manual_seed(0)
+        env = small_env(8)
+        options = {} if name == "drqn" else {"max_option_steps": 3}
+        settings = tiny_settings(stored_state=stored_state, batch_size=64, slice_len=2, burn_in=0.0)
+        algorithm = build(name, env, NETWORKS["compact"], settings=settings, **options)
+        learner = algorithm.learners[level]
+        learner.store(collect(algorithm, env, 30)[0])
+        sample = learner.sample()
+        for key in STATES[name, level]:
+            assert (key in sample) == stored_state
+        before = learner.update(sample.clone())
+        assert all(torch.isfinite(value) for value in before.values())
+        if stored_state:
+            before = learner.loss(sample)["loss"]
+            sample[STATES[name, level][0]][:, 0] += 1.0
+            assert learner.loss(sample)["loss"] != before
+
+    @pytest.mark.parametrize("name", ["dqn", "hdqn"])
+    def test_a_network_without_any_is_refused(self, name):
+        with pytest.raises(ValueError, match="stored_state must be False without recurrence, got True; "):
+            build(name, small_env(2), settings=tiny_settings(stored_state=True))
+
+
 class TestV3:
     def make(self, env=None, *, learner=None, **options):
         torch.manual_seed(0)
@@ -392,7 +429,9 @@ class TestV3:
 
     @pytest.mark.parametrize("sampling", ["steps", "episodes"])
     def test_sampling_in_mid_episode_is_refused(self, sampling):
-        with pytest.raises(ValueError, match=rf"sampling must be one of \(.*\) for v3, got '{sampling}': "):
+        with pytest.raises(
+            ValueError, match=rf"sampling must be one of \(.*\) for v3 without stored_state, got '{sampling}': "
+        ):
             self.make(learner={"sampling": sampling})
 
     def test_whole_episodes_teach_what_sequences_that_run_on_do(self):

@@ -210,6 +210,11 @@ class TestSettings:
         with pytest.raises(ValueError, match=f"{name} must be {rule}, got {value}; "):
             tiny_settings(**{name: value})
 
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    def test_states_that_are_zero_are_not_stored(self, sampling):
+        with pytest.raises(ValueError, match=f"stored_state must be False with sampling='{sampling}', got True; "):
+            tiny_settings(sampling=sampling, stored_state=True)
+
     def test_the_beginning_of_episodes_cannot_be_left_out_for_good(self):
         settings = {"sampling": "episode_starts", "train_exact_states": False}
         with pytest.raises(ValueError, match=r"with burn_in=0.5 and sampling='episode_starts', got False; "):

@@ -32,6 +32,7 @@ class OptionExtractor:
         traj_key: number of the episode.
         at_end: changes the entries ``[M]`` of the steps at which options ended before they are kept; for inputs
             that the environment's step does not hold.
+        state_keys: kept from the start only: the meta-controller's LSTM state before it chose.
         history: keeps the observations of whole options in the transitions, so that
             :func:`~hdrqn_torchrl.data.refresh_hidden` can compute v2's inputs anew.
 
@@ -62,6 +63,7 @@ class OptionExtractor:
         init_key: NestedKey = keys.IS_INIT,
         traj_key: NestedKey = keys.TRAJ_IDS,
         at_end: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        state_keys: Sequence[NestedKey] = (),
         history: OptionHistory | None = None,
     ) -> None:
         self.at_end, self.history = at_end, history
@@ -69,7 +71,7 @@ class OptionExtractor:
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
         self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
         inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
-        self._start_keys = [*inputs, init_key, traj_key]
+        self._start_keys = [*inputs, *state_keys, init_key, traj_key]
         self._end_keys = [*inputs, option_steps_key, option_return_key, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
         self.reset()
 

@@ -16,6 +16,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules.controllers import first_state
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
@@ -141,7 +142,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
 
     Acting takes one step: where an option starts the meta level chooses the subgoal, elsewhere it is kept; the action
     is chosen by the values of that subgoal. Learning (inside ``set_recurrent_mode(True)``) writes the values of all
-    steps, subgoals and actions, and the memory's output.
+    steps, subgoals and actions, and the memory's output, from the memory at the first step of a sequence if there is
+    one, else from zero.
 
     Args:
         network: the network.
@@ -193,7 +195,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         self.action_key, self.subgoal_key = action_key, subgoal_key
         self.action_value_key, self.subgoal_value_key = action_value_key, subgoal_value_key
         self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
-        carried = [hidden_key, cell_key, previous_action_key]
+        self.state_keys: list[NestedKey] = [hidden_key, cell_key]
+        carried = [*self.state_keys, previous_action_key]
         if isinstance(self.sub_exploration, RepeatingEpsilonGreedy):
             carried.append(repeated_action_key)
         self.in_keys = [observation_key, init_key, option_init_key, active_subgoal_key, mask_key, *carried]
@@ -213,10 +216,10 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         observation, previous_action, init, mask = (tensordict.get(key) for key in read)
         init = init.squeeze(-1)
         if recurrent_mode():
-            values = self.network.unroll(observation, previous_action, init, mask)
-            for key, value in zip(
-                (self.action_value_key, self.subgoal_value_key, self.hidden_key), values, strict=True
-            ):
+            state = first_state(tensordict, self.state_keys)
+            values = self.network.unroll(observation, previous_action, init, mask, state)
+            written = (self.action_value_key, self.subgoal_value_key, self.hidden_key)
+            for key, value in zip(written, values, strict=True):
                 tensordict.set(key, value)
             return tensordict
         state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)

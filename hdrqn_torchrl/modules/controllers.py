@@ -2,7 +2,8 @@
 
 A controller has two paths through the same parameters. Acting (the default) takes one step from the LSTM
 state in the tensordict. Learning (inside ``set_recurrent_mode(True)``, which every TorchRL loss enters)
-unrolls whole sequences ``[B, T]`` from the zero state. Each is one ``TensorDictModuleBase`` and not a chain
+unrolls whole sequences ``[B, T]``, from the LSTM state at their first step if the tensordict has one, else from
+zero. Each is one ``TensorDictModuleBase`` and not a chain
 of TorchRL's modules because such a chain costs several times the arithmetic of a small network.
 """
 
@@ -77,7 +78,8 @@ class SubController(TensorDictModuleBase):
         self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
         self.repeats = isinstance(self.exploration, RepeatingEpsilonGreedy)
         self.in_keys = [observation_key, *([] if subgoal_key is None else [subgoal_key]), init_key]
-        carried = [hidden_key, cell_key] if network.recurrent else []
+        self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
+        carried = [*self.state_keys]
         carried += [repeated_action_key] if self.repeats else []
         self.in_keys += carried
         self.out_keys = [action_key, *(_next(key) for key in carried)]
@@ -92,7 +94,9 @@ class SubController(TensorDictModuleBase):
         subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
         init = tensordict.get(self.init_key)  # [*batch, 1]
         if recurrent_mode():
-            return tensordict.set(self.action_value_key, self.network.unroll(observation, subgoal, init.squeeze(-1)))
+            state = first_state(tensordict, self.state_keys)
+            value = self.network.unroll(observation, subgoal, init.squeeze(-1), state)
+            return tensordict.set(self.action_value_key, value)
         if not self.network.recurrent:
             return tensordict.set(
                 self.action_key, self._choose(self.network.evaluate(observation, subgoal), tensordict)
@@ -173,10 +177,9 @@ class MetaController(TensorDictModuleBase):
         self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key
         self.acting_keys = [gate_key, active_subgoal_key]
         self.in_keys = [*self.input_keys, *([] if mask_key is None else [mask_key])]
-        self.out_keys = [subgoal_key]
-        if network.recurrent:
-            self.in_keys += [hidden_key, cell_key]
-            self.out_keys += [_next(hidden_key), _next(cell_key)]
+        self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
+        self.in_keys += self.state_keys
+        self.out_keys = [subgoal_key, *(_next(key) for key in self.state_keys)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
@@ -189,7 +192,8 @@ class MetaController(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = self._inputs(tensordict)
         if recurrent_mode():
-            return tensordict.set(self.action_value_key, self.network.unroll(inputs))
+            state = first_state(tensordict, self.state_keys)
+            return tensordict.set(self.action_value_key, self.network.unroll(inputs, state=state))
         gate = tensordict.get(self.gate_key)
         if self.network.recurrent:
             state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
@@ -241,6 +245,14 @@ class HierarchicalPolicy(TensorDictModuleBase):
             for key, value in zip((sub.hidden_key, sub.cell_key), advanced, strict=True):
                 tensordict.set(key, torch.where(ended, value, tensordict.get(key)))
         return self.sub_controller(self.meta_controller(tensordict))
+
+
+def first_state(tensordict: TensorDictBase, state_keys: Sequence[NestedKey]) -> State | None:
+    """LSTM state ``[B, H]`` at the first step of sequences ``[B, T]``; ``None`` if the tensordict holds none."""
+    if not state_keys or tensordict.get(state_keys[0], None) is None:
+        return None
+    hidden, cell = (tensordict.get(key) for key in state_keys)
+    return hidden[:, 0], cell[:, 0]
 
 
 def _next(key: NestedKey) -> tuple[str, ...]:

@@ -112,13 +112,20 @@ class QNetwork(nn.Module):
         """Q-values ``[*, A]`` of a network without memory."""
         return self.head(self.memory(self._embed(observation, condition)))
 
-    def unroll(self, observation: Tensor, condition: Tensor | None = None, init: Tensor | None = None) -> Tensor:
-        """Q-values along sequences that start from the zero state.
+    def unroll(
+        self,
+        observation: Tensor,
+        condition: Tensor | None = None,
+        init: Tensor | None = None,
+        state: State | None = None,
+    ) -> Tensor:
+        """Q-values along sequences.
 
         Args:
             observation: ``[B, T, ...]``.
             condition: ``[B, T]`` int64, or ``None`` if the network has no condition.
             init: ``[B, T]`` bool; where set, the state restarts from zero before that step.
+            state: LSTM state before the first step, two tensors ``[B, H]``; zero if not given.
 
         Returns:
             ``[B, T, A]``.
@@ -126,9 +133,14 @@ class QNetwork(nn.Module):
         if not isinstance(self.memory, nn.LSTM):
             return self.evaluate(observation, condition)
         features = self._embed(observation, condition)
-        if init is None or not init[:, 1:].any():
+        if init is not None and init[:, 1:].any():
+            state = self.initial_state(len(features)) if state is None else state
+            return self.head(restarting_lstm(self.memory, features, init, state))
+        if state is None:
             return self.head(self.memory(features)[0])
-        return self.head(restarting_lstm(self.memory, features, init, self.initial_state(len(features))))
+        if init is not None:
+            state = state[0].masked_fill(init[:, :1], 0.0), state[1].masked_fill(init[:, :1], 0.0)
+        return self.head(self.memory(features, (state[0][None].contiguous(), state[1][None].contiguous()))[0])
 
     def final_state(self, observation: Tensor, condition: Tensor | None, lengths: Tensor) -> State:
         """State at the end of sequences of different lengths that start from the zero state.

@@ -46,7 +46,8 @@ class AllSubgoalsLoss(LossModule):
     """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + 1]`` of consecutive steps.
 
     The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
-    on through ends of episodes; each should begin where an episode does, because the memory starts empty. Steps
+    on through ends of episodes; each should begin where an episode does, because the memory starts empty, unless it
+    starts from what was stored (``stored_state``). Steps
     after a sequence's end are padding (``mask``): they contribute nothing, and what the last real step led to is
     unknown unless it ended the episode.
 
@@ -67,6 +68,8 @@ class AllSubgoalsLoss(LossModule):
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
             in sequences that begin where an episode does, every state is exact.
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
+        stored_state: sequences start from the LSTM state that acting had at their first step, in both networks, and
+            from zero where an episode starts.
         prediction_weight: of the error of the network's predictor, if it has one; how many steps ahead it looks is
             drawn anew for every minibatch.
 
@@ -123,6 +126,7 @@ class AllSubgoalsLoss(LossModule):
         burn_in: float = 0.0,
         train_exact_states: bool = True,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
+        stored_state: bool = False,
         prediction_weight: float = 0.1,
     ) -> None:
         if prediction_weight < 0.0:
@@ -145,6 +149,7 @@ class AllSubgoalsLoss(LossModule):
         self.hazard_reward, self.double = hazard_reward, double
         self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
         self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
+        self.state_keys = list(policy.state_keys) if stored_state else []
         self.prediction_weight = prediction_weight
         if self._predicts:
             self.out_keys = [*self.out_keys, "prediction_loss"]
@@ -156,6 +161,7 @@ class AllSubgoalsLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         policy, k = self._policies[0], self.tensor_keys
         read = [policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key, k.action]
+        read += self.state_keys
         nexts = [k.attained, k.extrinsic_reward, k.done, k.terminated, k.active_subgoal]
         nexts += [k.hazard] if self.hazard_reward else []
         return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
@@ -206,7 +212,8 @@ class AllSubgoalsLoss(LossModule):
         """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network; the main
         network's memory ``[B, T + 1, H]``."""
         policy, target_policy = self._policies
-        inputs = tensordict.select(policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
+        read = (policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
+        inputs = tensordict.select(*read, *self.state_keys)
 
         def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor, Tensor]:
             values = which(inputs.copy())

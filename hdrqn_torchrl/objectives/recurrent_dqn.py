@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Literal
@@ -35,8 +36,9 @@ class RecurrentDQNLoss(LossModule):
               L = \text{mean}_t\,(y_t - Q(x_t, a_t))^2
 
     Online and target network are each unrolled once over the T + 1 inputs :math:`x_0 \dots x_T`, from the zero
-    state, so that both see the same context. TorchRL's ``DQNLoss`` unrolls three times over T, starts its targets
-    one step late and lets the state run across the slices of a flat batch, hence this loss.
+    state or from a stored one (``state_keys``), so that both see the same context. TorchRL's ``DQNLoss`` unrolls three
+    times over T, starts its targets one step late and lets the state run across the slices of a flat batch, hence
+    this loss.
 
     - Steps that enter the loss: :func:`~hdrqn_torchrl.objectives.targets.training_mask`.
     - Padding (``mask``) contributes nothing; even NaN in it reaches no gradient.
@@ -48,7 +50,7 @@ class RecurrentDQNLoss(LossModule):
     Args:
         value_network: in recurrent mode reads its ``in_keys`` ``[B, T + 1, ...]`` and writes ``action_value``
             ``[B, T + 1, A]``: one of our controllers, or any TorchRL sequence of modules with an ``LSTMModule``.
-            Entries that it also writes to ``"next"`` are recurrent states and start from zero.
+            Entries that it also writes to ``"next"`` are recurrent states and start from zero, or from ``state_keys``.
 
     Keyword Args:
         gamma: discount of one environment step.
@@ -62,6 +64,8 @@ class RecurrentDQNLoss(LossModule):
             the next action is the main network's greedy one. 0 is the one-step target.
         n_step: rewards before the value; 1 is the one-step target. Later actions are taken as they came, exploratory
             or not, as in Rainbow (Hessel et al., 2018) and R2D2: some bias for faster news.
+        state_keys: recurrent states that acting had, stored with the steps: sequences start from them, in both
+            networks (Kapturowski et al., 2019), and from zero where ``init`` is set. None: all start from zero.
         delay_value: whether a target network is kept (update it with TorchRL's ``SoftUpdate`` or ``HardUpdate``).
 
     Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
@@ -118,6 +122,7 @@ class RecurrentDQNLoss(LossModule):
         max_target: float | None = None,
         trace_decay: float = 0.0,
         n_step: int = 1,
+        state_keys: Sequence[NestedKey] = (),
         delay_value: bool = True,
     ) -> None:
         if not 0.0 <= gamma <= 1.0:
@@ -127,6 +132,11 @@ class RecurrentDQNLoss(LossModule):
         if loss_function not in ("l2", "smooth_l1"):
             raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the paper uses 'l2'.")
         check_returns(trace_decay, n_step)
+        if unknown := {unravel_key(key) for key in state_keys} - {unravel_key(key) for key in value_network.in_keys}:
+            raise ValueError(
+                f"state_keys must be recurrent states that the network reads, got {sorted(map(str, unknown))}; a "
+                "feed-forward network has none."
+            )
         super().__init__()
         self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
         # Both networks as they are called, outside the module tree: their parameters are those registered above.
@@ -140,6 +150,7 @@ class RecurrentDQNLoss(LossModule):
         self.burn_in, self.train_exact_states = burn_in, train_exact_states
         self.double, self.loss_function, self.max_target = double, loss_function, max_target
         self.trace_decay, self.n_step = trace_decay, n_step
+        self.state_keys = list(state_keys)
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -158,7 +169,8 @@ class RecurrentDQNLoss(LossModule):
         nexts = [k.reward, k.done, k.terminated, *([] if k.steps is None else [k.steps]), *self._input_keys]
         masks = [] if k.action_mask is None else [k.action_mask]
         flags = [k.init] if k.eligible is None else [k.init, k.eligible]
-        return [k.action, *flags, *self._input_keys, *masks, *(unravel_key(("next", key)) for key in nexts + masks)]
+        now = [k.action, *flags, *self._input_keys, *self.state_keys, *masks]
+        return [*now, *(unravel_key(("next", key)) for key in nexts + masks)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         k, after = self.tensor_keys, tensordict["next"]
@@ -234,6 +246,10 @@ class RecurrentDQNLoss(LossModule):
                 if stream.is_floating_point():
                     stream = stream.masked_fill(~_expand(own | reached, stream), 0.0)
             inputs.set(key, stream)
+        for key in self.state_keys:
+            state = tensordict[key]
+            state = state.masked_fill(_expand(init | ~valid, state), 0.0)
+            inputs.set(key, torch.cat([state, torch.zeros_like(state[:, :1])], 1))
         restart = torch.cat([init, torch.zeros_like(init[:, :1])], 1)
         return inputs.set(k.init, restart.unsqueeze(-1))
 

@@ -156,10 +156,10 @@ def n_step_returns(
 
 
 def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_states: bool) -> Tensor:
-    """Which steps of zero-start sequences enter the loss (the paper: the last half).
+    """Which steps of sequences enter the loss (the paper: the last half).
 
-    The state at the first steps of a sequence lacks the history before the slice. It is exact from the first
-    step on at which acting, too, restarted from zero.
+    The state at the first steps of a sequence lacks the history before the slice, or was stored by older weights. It
+    is exact from the first step on at which acting, too, restarted from zero.
 
     Args:
         valid: steps that are not padding; padding only follows valid steps.

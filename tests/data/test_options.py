@@ -114,6 +114,12 @@ class TestOptions:
             ("next", "option_return"), ("next", "done"), ("next", "terminated"), ("next", "truncated"),
         }  # fmt: skip
 
+    def test_states_are_kept_from_the_start_only(self):
+        extractor, batch = OptionExtractor(input_keys=["observation"], state_keys=["extra"]), random_play(3, 60)
+        options, expected = extractor(batch), PlainExtractor()(batch)
+        assert options["extra"].tolist() == [start["extra"].item() for start, _ in expected]
+        assert "extra" not in options["next"]
+
     def test_at_end_changes_what_is_kept_from_the_end_and_nothing_else(self):
         plain = self.extract(input_keys=["observation"])
         changed = self.extract(at_end=lambda after: after.set("observation", after["observation"] + 1))

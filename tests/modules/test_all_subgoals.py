@@ -264,14 +264,14 @@ def test_values_of():
 class TestInTheEnvironment:
     """Rollouts of random or greedy play through many short episodes, with the values that it acted by."""
 
-    def play(self, steps=40, *, epsilon=0.5, kind=ExplorationType.RANDOM, max_steps=6, **options):
+    def play(self, steps=40, *, epsilon=0.5, kind=ExplorationType.RANDOM, max_steps=6, learner=None, **options):
         torch.manual_seed(0)
         env = small_env(5, max_steps=max_steps)
         schedules = {
             "sub_exploration": RepeatingEpsilonGreedy(epsilon, epsilon, exponent=0.2),
             "meta_exploration": EpsilonGreedy(epsilon, epsilon),
         }
-        settings = tiny_settings(sampling="episode_starts", slice_len=9, batch_size=32)
+        settings = tiny_settings(**({"sampling": "episode_starts", "slice_len": 9, "batch_size": 32} | (learner or {})))
         self.algorithm = make_v3(
             env, compact_network(8, (8,)), learner=settings, memory_size=6, head_size=6, **(schedules | options)
         )
@@ -312,6 +312,21 @@ class TestInTheEnvironment:
                 env, time = place[sample["collector", "traj_ids"][row, 0].item()]
                 assert (trajectory[env, time : time + 10] == sample["collector", "traj_ids"][row]).all()
                 torch.testing.assert_close(values[row], acted_by[env, time : time + 10], **EXACT)
+
+    @pytest.mark.parametrize("sampling", ["steps", "episodes"])
+    def test_sequences_from_the_middle_unroll_to_the_values_acted_by(self, sampling):
+        """From stored states, in slices that end with their episode."""
+        batch = self.play(learner={"sampling": sampling, "stored_state": True, "slice_len": 4})
+        learner, time = self.algorithm.learners["joint"], torch.arange(40).expand(5, 40)
+        batch["time"], batch["env"] = time.contiguous(), torch.arange(5)[:, None].expand(5, 40).contiguous()
+        learner.extract.root_keys += ["time", "env"]
+        learner.store(batch)
+        sample = learner.sample()
+        assert sample.shape == (32, 5) and (~sample["is_init"][:, 0]).sum() > 10
+        real, place = sample["collector", "mask"], (sample["env"], sample["time"])
+        assert not real.all()
+        for values, acted_by in zip(self.unrolled(sample), (self.action_value, self.subgoal_value), strict=True):
+            torch.testing.assert_close(values[real], acted_by[place][real], **EXACT)
 
     def test_what_is_carried_goes_from_step_to_step_and_is_empty_in_every_new_episode(self):
         batch = self.play()

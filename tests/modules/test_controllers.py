@@ -1,6 +1,6 @@
 import pytest
 import torch
-from helpers import build, collect, small_env
+from helpers import build, collect, small_env, tiny_settings
 from tensordict import TensorDict
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
@@ -221,6 +221,38 @@ class TestActingAndLearningAgree:
         stored = algorithm.learners["sub"].extract(steps)
         acted = sub.network.head(steps["next", "sub_hidden"])
         torch.testing.assert_close(self.learned_values(sub, stored), acted.detach(), **EXACT)
+
+    @pytest.mark.parametrize("start", [0, 1, 4, 17])
+    @pytest.mark.parametrize(("name", "level"), [("drqn", "flat"), ("v1", "sub"), ("v2", "sub")])
+    def test_from_the_middle_on_with_stored_states(self, name, level, start):
+        options = {} if name == "drqn" else {"max_option_steps": 5}
+        algorithm, steps = self.collected(name, "compact", settings=tiny_settings(stored_state=True), **options)
+        controller = algorithm.policy if name == "drqn" else algorithm.policy.sub_controller
+        stored = algorithm.learners[level].extract(steps)[:, start:]
+        acted = controller.network.head(steps["next", "sub_hidden"])[:, start:].detach()
+        torch.testing.assert_close(self.learned_values(controller, stored), acted, **EXACT)
+        inside = ~steps[controller.init_key][:, start].squeeze(-1)
+        assert inside.any() == (start > 0)
+        if start:  # without them, the values are others
+            values = self.learned_values(controller, stored.exclude("sub_hidden", "sub_cell"))
+            assert not torch.allclose(values[inside], acted[inside])
+
+    @pytest.mark.parametrize("name", ["v1", "v2"])
+    def test_every_single_option_with_stored_states(self, name):
+        settings = tiny_settings(stored_state=True)
+        algorithm, steps = self.collected(name, "compact", settings=settings, max_option_steps=2)
+        meta = algorithm.policy.meta_controller
+        stored = algorithm.learners["meta"].extract(steps)
+        starts = steps[steps["option_init"].squeeze(-1)]
+        acted = meta.network.head(starts["next", "meta_hidden"]).detach()
+        place = {(row["collector", "traj_ids"].item(), *row["meta_hidden"].tolist()): i for i, row in enumerate(starts)}
+        assert len(place) == len(starts) and (~stored["is_init"]).sum() > 10
+        rows = [place[row["collector", "traj_ids"].item(), *row["meta_hidden"].tolist()] for row in stored]
+        learned = self.learned_values(meta, stored.unsqueeze(1)).squeeze(1)  # sequences of one option
+        torch.testing.assert_close(learned, acted[rows], **EXACT)
+        zero = self.learned_values(meta, stored.exclude("meta_hidden", "meta_cell").unsqueeze(1)).squeeze(1)
+        later = ~stored["is_init"].squeeze(-1)
+        assert not torch.isclose(zero, acted[rows])[later].all(-1).any()
 
     @pytest.mark.parametrize("network", NETWORKS)
     @pytest.mark.parametrize("name", ["dqn", "hdqn"])

@@ -32,6 +32,23 @@ def test_unroll_equals_a_loop_over_steps(recurrent, num_conditions, restarts, ga
     torch.testing.assert_close(values, unroll_by_steps(network, observation, condition, init))
 
 
+@pytest.mark.parametrize("restarts", [[], [0], [3], [0, 2]], ids=str)
+def test_unroll_from_a_given_state_goes_on_from_it(restarts):
+    """Equal to the whole sequence from its beginning, cut in two; where the state restarts it is forgotten."""
+    network = make_network()
+    observation, init = torch.randn(3, 9, 5), torch.zeros(3, 9, dtype=torch.bool)
+    state = network.initial_state(3)
+    for t in range(4):
+        _, state = network.step(observation[:, t], None, state)
+    init[1, [4 + place for place in restarts]] = True
+    whole = network.unroll(observation, None, init)
+    for flags in (init[:, 4:], *([] if restarts else [None])):
+        torch.testing.assert_close(network.unroll(observation[:, 4:], None, flags, state), whole[:, 4:])
+    lost = network.unroll(observation[:, 4:], None, init[:, 4:])
+    assert (lost[0] != whole[0, 4:]).any()
+    assert torch.allclose(lost[1, 0], whole[1, 4]) == (0 in restarts)
+
+
 def test_a_restart_forgets_what_came_before_and_nothing_else_does():
     network, observation = make_network(), torch.randn(1, 6, 5)
     changed = observation.clone()

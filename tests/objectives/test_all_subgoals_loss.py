@@ -62,7 +62,7 @@ class Tables(nn.Module):
         self.action_value = nn.Parameter(torch.randn(steps, subgoals, actions))
         self.subgoal_value = nn.Parameter(torch.randn(steps, subgoals))
 
-    def unroll(self, observation, previous_action, init, mask):
+    def unroll(self, observation, previous_action, init, mask, state=None):
         return self.action_value[observation], self.subgoal_value[observation], observation
 
 
@@ -434,10 +434,11 @@ def check_gradient(grad, values, targets):
 class TestInTheEnvironment:
     """On sequences that real play left in the memory, with a real network."""
 
-    def sample(self, sampling="episode_starts", **options):
+    def sample(self, settings=None, **options):
         torch.manual_seed(0)
         env = small_env(8, max_steps=6, view=5)
-        settings = tiny_settings(sampling=sampling, slice_len=10, batch_size=32, learning_rate=1e-2)
+        usual = {"sampling": "episode_starts", "slice_len": 10, "batch_size": 32, "learning_rate": 1e-2}
+        settings = tiny_settings(**(usual | (settings or {})))
         sizes = {"memory_size": 8, "head_size": 8, "prediction_steps": 0}
         algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, **(sizes | options))
         self.learner = algorithm.learners["joint"]
@@ -453,14 +454,27 @@ class TestInTheEnvironment:
         with torch.no_grad():
             return [value for pair in loss._values(td)[:2] for value in pair]
 
-    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    @pytest.mark.parametrize(
+        "settings",
+        [
+            {"sampling": "episode_starts"},
+            {"sampling": "whole_episodes"},
+            {"sampling": "steps", "stored_state": True, "burn_in": 0.0},
+            {"sampling": "steps", "stored_state": True, "burn_in": 0.2, "slice_len": 6, "batch_size": 64},
+            {"sampling": "episodes", "stored_state": True, "burn_in": 0.4, "slice_len": 3, "batch_size": 64},
+        ],
+        ids=str,
+    )
     @pytest.mark.parametrize("options", [{}, {"max_option_steps": 2, "trace_decay": 1.0}], ids=str)
-    def test_losses(self, options, sampling):
-        loss, td = self.sample(sampling, **options)
+    def test_losses(self, options, settings):
+        loss, td = self.sample(settings, **options)
         result = loss(td)
-        assert (("collector", "mask") in td.keys(True)) == (sampling == "whole_episodes")
-        sub, meta = Reference(self.values(loss, td), td, trace_decay=options.get("trace_decay", 0.8)).run()
-        assert result["trained_steps"] == len(sub) > 200 and len(meta) > 100
+        padded = not td.get(("collector", "mask"), torch.tensor(True)).all()
+        assert padded == (settings["sampling"] in ("whole_episodes", "steps"))
+        assert td["is_init"][:, 0].all() != settings.get("stored_state", False)
+        others = {"burn_in": settings.get("burn_in", 0.5), "trace_decay": options.get("trace_decay", 0.8)}
+        sub, meta = Reference(self.values(loss, td), td, **others).run()
+        assert result["trained_steps"] == len(sub) > 100 and len(meta) > 50
         assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-4)
         assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-4)
 
@@ -497,7 +511,7 @@ class TestInTheEnvironment:
 
     @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
     def test_predictions_within_an_episode_enter_the_loss_and_train_the_memory(self, sampling):
-        loss, td = self.sample(sampling=sampling, prediction_steps=3, prediction_weight=0.5)
+        loss, td = self.sample({"sampling": sampling}, prediction_steps=3, prediction_weight=0.5)
         valid = loss._valid(td)
         network, seen = self.learner.network.network, set()
         rows, steps = td.shape
@@ -530,6 +544,18 @@ class TestInTheEnvironment:
         loss, td = self.sample(prediction_steps=3, prediction_weight=0.0)
         assert "prediction_loss" not in loss(td) and "prediction_loss" not in loss.out_keys
 
+    def test_both_networks_start_from_the_stored_state(self):
+        loss, td = self.sample({"stored_state": True, "sampling": "steps"})
+        before = self.values(loss, td)
+        middle = ~td["is_init"][:, 0].squeeze(-1)
+        assert middle.sum() > 8 and (~middle).sum() > 2
+        td["memory_hidden"][:, 0] += 1.0
+        for old, new in zip(before, self.values(loss, td), strict=True):
+            assert (old[middle] != new[middle]).flatten(1).any(1).all()
+            assert (old[~middle] == new[~middle]).all()
+        td["memory_hidden"][:, 1:] = math.nan  # only the first one is read
+        assert all(torch.isfinite(value).all() for value in self.values(loss, td))
+
     def test_the_target_moves_by_the_updater_only(self):
         loss, td = self.sample()
         before = loss.target_policy_params.data.clone()
@@ -544,11 +570,14 @@ class TestInTheEnvironment:
                 torch.testing.assert_close(loss.target_policy_params[key], moved, rtol=0, atol=1e-6)
         assert parameter_distance(before, loss.target_policy_params.data) > 0
 
+    @pytest.mark.parametrize("stored_state", [False, True])
     @pytest.mark.parametrize("hazard_reward", [-1.0, 0.0])
-    def test_it_reads_what_it_asks_for_and_nothing_else(self, hazard_reward):
-        loss, td = self.sample(hazard_reward=hazard_reward, intra_option=False)
+    def test_it_reads_what_it_asks_for_and_nothing_else(self, hazard_reward, stored_state):
+        settings = {"stored_state": True, "sampling": "steps", "burn_in": 0.0} if stored_state else {}
+        loss, td = self.sample(settings, hazard_reward=hazard_reward, intra_option=False)
+        td = td.exclude(("collector", "mask"))
         whole, needed = loss(td), td.select(*loss.in_keys)
-        assert len(needed.keys(True, True)) == len(loss.in_keys) == 12 - (hazard_reward == 0.0)
+        assert len(needed.keys(True, True)) == len(loss.in_keys) == 12 - (hazard_reward == 0.0) + 2 * stored_state
         assert loss(needed)["loss"] == whole["loss"]
         for key in loss.in_keys:
             with pytest.raises(KeyError):

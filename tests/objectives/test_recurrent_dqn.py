@@ -104,7 +104,19 @@ def make_sample(seed=0, *, padded=True):
     return sample
 
 
-def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, huber=False, limit=None, **targets):
+def reference(
+    loss,
+    network,
+    sample,
+    *,
+    level="flat",
+    burn_in=0.5,
+    exact=True,
+    huber=False,
+    limit=None,
+    state=None,
+    **targets,
+):
     """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps."""
     keys = {"action": "action", "reward": "reward", "done": "done", "terminated": "terminated", "init": "is_init"}
     keys |= {"flat": {}, "sub": SUB_KEYS, "meta": META_KEYS}[level]
@@ -115,9 +127,10 @@ def reference(loss, network, sample, *, level="flat", burn_in=0.5, exact=True, h
         stream = torch.cat([sample["observation"][b, :length], after["observation"][b, length - 1 : length]])[None]
         subgoal = sample["subgoal"][b : b + 1, :1].repeat(1, length + 1) if level == "sub" else None
         init = torch.cat([sample[keys["init"]][b, :length, 0], torch.tensor([False])])[None]
-        q = unroll_by_steps(network, stream, subgoal, init)[0]
+        first = None if state is None else [part[b : b + 1] for part in state]
+        q = unroll_by_steps(network, stream, subgoal, init, first)[0]
         with torch.no_grad():
-            target_q = unroll_by_steps(target_network, stream, subgoal, init)[0]
+            target_q = unroll_by_steps(target_network, stream, subgoal, init, first)[0]
         done, terminated = after[keys["done"]][b, :length, 0], after[keys["terminated"]][b, :length, 0]
         masks = torch.ones(length + 1, ACTIONS, dtype=torch.bool)
         if "action_mask" in keys:
@@ -233,6 +246,74 @@ class TestAgainstPlainLoops:
         assert result["loss"].item() >= result["td_error"].item() ** 2
         assert (result["target"] - result["q_value"]).abs().item() <= result["td_error"].item() + 1e-12
         assert not any(result[key].requires_grad for key in loss.out_keys if key != "loss")
+
+
+class TestStoredStates:
+    """Sequences that start from the LSTM state that acting had."""
+
+    def make(self, level, **settings):
+        prefix = "meta" if level == "meta" else "sub"
+        state_keys = [f"{prefix}_hidden", f"{prefix}_cell"]
+        loss, network = make_loss(level, state_keys=state_keys, **settings)
+        sample = make_sample()
+        generator = torch.Generator().manual_seed(1)
+        for key in state_keys:
+            sample[key] = torch.rand(BATCH, TIME, 6, generator=generator, dtype=torch.double)
+        return loss, network, sample, [sample[key][:, 0].clone() for key in state_keys]
+
+    @pytest.mark.parametrize("burn_in", [0.0, 0.5])
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    def test_loss_and_gradients_against_plain_loops(self, level, burn_in):
+        loss, network, sample, state = self.make(level, burn_in=burn_in)
+        result = loss(sample.clone())
+        wanted, count = reference(loss, network, sample, level=level, burn_in=burn_in, state=state)
+        assert result["trained_steps"] == count
+        torch.testing.assert_close(result["loss"], wanted)
+        assert (result["loss"] - reference(loss, network, sample, level=level, burn_in=burn_in)[0]).abs() > 1e-3
+        parameters = list(network.parameters())
+        gradients = torch.autograd.grad(result["loss"], parameters)
+        for gradient, want in zip(gradients, torch.autograd.grad(wanted, parameters), strict=True):
+            torch.testing.assert_close(gradient, want)
+
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    def test_only_the_first_one_is_read_and_only_where_no_episode_or_option_starts(self, level):
+        loss, _, sample, _ = self.make(level, burn_in=0.0)
+        wanted = loss(sample.clone())["loss"]
+        for key in loss.state_keys:
+            sample[key][:, 1:], sample[key][1] = NAN, NAN  # row 1 starts an episode
+        torch.testing.assert_close(loss(sample)["loss"], wanted)
+
+    def test_they_are_asked_for(self):
+        loss, _, sample, _ = self.make("sub")
+        assert {"sub_hidden", "sub_cell"} <= set(loss.in_keys)
+        with pytest.raises(KeyError, match="sub_cell"):
+            loss(sample.exclude("sub_cell"))
+
+    def test_a_stock_lstm_starts_from_them_and_restarts_from_zero(self):
+        torch.manual_seed(0)
+        lstm = LSTMModule(input_size=SIZE, hidden_size=6, in_key="observation", out_key="features").double()
+        head = nn.Linear(6, ACTIONS).double()
+        network = TensorDictSequential(lstm, TensorDictModule(head, in_keys=["features"], out_keys=["action_value"]))
+        loss = RecurrentDQNLoss(network, gamma=0.9, burn_in=0.0, state_keys=["recurrent_state_h", "recurrent_state_c"])
+        sample = make_sample(padded=False)
+        sample["is_init"][2, 2] = True  # a new episode in mid-sequence
+        sample["next", "done"][2, 1] = sample["next", "terminated"][2, 1] = True
+        for key in loss.state_keys:
+            sample[key] = torch.rand(BATCH, TIME, 1, 6, dtype=torch.double)
+        stream = torch.cat([sample["observation"], sample["next", "observation"][:, -1:]], 1)
+        state = [sample[key][:, 0].transpose(0, 1).contiguous() for key in loss.state_keys]
+        for part in state:
+            part[:, 1] = 0.0  # row 1 starts an episode
+        q = head(lstm.lstm(stream, tuple(state))[0])
+        q[2, 2:] = head(lstm.lstm(stream[2:3, 2:])[0])[0]
+        chosen = q[:, :-1].gather(-1, sample["action"][..., None])[..., 0]
+        value = q[:, 1:].max(-1).values * ~sample["next", "terminated"][..., 0]
+        error = (sample["next", "reward"][..., 0] + 0.9 * value - chosen) ** 2
+        torch.testing.assert_close(loss(sample)["loss"], error.mean())
+
+    def test_a_network_without_them_is_refused(self):
+        with pytest.raises(ValueError, match=r"state_keys must be recurrent states .* got \['sub_hidden'\]"):
+            make_loss(recurrent=False, state_keys=["sub_hidden"])
 
 
 class TestLeaks:
