@@ -1,5 +1,6 @@
 """From collected steps to replayed sequences."""
 
+from hdrqn_torchrl.data.hindsight import HindsightOptions, relabel_subgoals
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
 from hdrqn_torchrl.data.replay import (
@@ -12,6 +13,7 @@ from hdrqn_torchrl.data.replay import (
 
 __all__ = [
     "EpisodeStartSampler",
+    "HindsightOptions",
     "OptionExtractor",
     "OptionHistory",
     "Sampling",
@@ -19,5 +21,6 @@ __all__ = [
     "StepSliceSampler",
     "make_sequence_buffer",
     "refresh_hidden",
+    "relabel_subgoals",
     "sample_sequences",
 ]
