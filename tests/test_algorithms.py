@@ -25,9 +25,12 @@ NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
         ("v2", {"meta_input": "cell"}),
         ("v2", {"meta_input": "both"}),
         ("v2", {"meta_input_time": "after_last_observation"}),
+        ("hdqn", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v1", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v2", {"sub_hindsight": True, "meta_hindsight": True}),
         ("v3", {}),
     ],
-    ids=lambda value: value if isinstance(value, str) else "-".join(value.values()),
+    ids=lambda value: value if isinstance(value, str) else "-".join(str(option) for option in value.values()),
 )
 def test_every_algorithm_collects_and_updates_each_level(name, options, network, layout):
     torch.manual_seed(0)

@@ -160,7 +160,7 @@ class HindsightOptions:
         as_they_were = self.pursued(batch)
         told, relabelled = self._retell(batch)
         in_hindsight = self._keep_changed(self.retold(told), batch.get(self.pursued.traj_key), relabelled)
-        found = [options for options in (as_they_were, in_hindsight) if options is not None and len(options)]
+        found = [options for options in (as_they_were, in_hindsight) if options is not None]
         return torch.cat(found) if found else None
 
     def _retell(self, batch: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
