@@ -18,8 +18,16 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker, TransformedEnv
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data import FROM_STARTS, OptionExtractor, OptionHistory, StepSelector, refresh_hidden
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.data import (
+    FROM_STARTS,
+    HindsightOptions,
+    OptionExtractor,
+    OptionHistory,
+    StepSelector,
+    refresh_hidden,
+    relabel_subgoals,
+)
+from hdrqn_torchrl.learner import Extract, Learner, LearnerSettings
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
     AllSubgoalsPolicy,
@@ -179,6 +187,8 @@ def make_hdrqn(
     wrong_subgoal_reward: float = 0.0,
     hazard_reward: float = -1.0,
     max_option_steps: int | None = None,
+    sub_hindsight: bool = False,
+    meta_hindsight: bool = False,
     recurrent: bool = True,
 ) -> Algorithm:
     r"""Hierarchical deep recurrent Q-learning (Algorithm 1).
@@ -202,10 +212,15 @@ def make_hdrqn(
         wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one.
         hazard_reward: intrinsic reward for meeting the hazard.
         max_option_steps: step limit of an option.
+        sub_hindsight: learn about every subgoal from each sequence (:func:`~hdrqn_torchrl.data.relabel_subgoals`); a
+            minibatch then holds ``sub.batch_size`` times the number of subgoals.
+        meta_hindsight: learn from options as if they had been chosen for what they attained, too
+            (:class:`~hdrqn_torchrl.data.HindsightOptions`).
         recurrent: ``False`` gives hDQN (with ``version="v1"``).
 
     Raises:
-        ValueError: if ``version`` or ``meta_input`` is unknown, or v2 is asked for without recurrence.
+        ValueError: if ``version`` or ``meta_input`` is unknown, v2 is asked for without recurrence, or
+            hindsight with n-step targets (sub level) or stored states.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -222,6 +237,17 @@ def make_hdrqn(
             f"meta_input_time must be 'after_last_decision' or 'after_last_observation', got {meta_input_time!r}; "
             "the paper's Algorithm 1 has the former."
         )
+    if sub_hindsight and sub.n_step > 1:
+        raise ValueError(
+            f"sub.n_step must be 1 with sub_hindsight=True, got {sub.n_step}: later actions pursued another subgoal; "
+            "use sub.trace_decay, which looks on only while actions are the greedy ones for the subgoal in question."
+        )
+    for level, settings, hindsight in (("sub", sub, sub_hindsight), ("meta", meta, meta_hindsight)):
+        if settings.stored_state and hindsight:
+            raise ValueError(
+                f"{level}.stored_state must be False with {level}_hindsight=True: acting had its states on the way to "
+                "the subgoal it pursued, not to the one that is learned about."
+            )
     sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
     observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
@@ -240,17 +266,32 @@ def make_hdrqn(
         mask_key=mask_key,
     )
     reads_last = version == "v2" and meta_input_time == "after_last_observation"
-    history, refresh = None, None
-    if version == "v2" and refresh_hidden_steps is not None:
-        history = OptionHistory(refresh_hidden_steps)
-        refresh = partial(refresh_hidden, sub_controller, refresh_hidden_steps, read_last_observation=reads_last)
+    option_gamma = gamma if smdp_discount else 1.0
+    refresh_steps, refresh = refresh_hidden_steps if version == "v2" else None, None
+    if refresh_steps is not None:
+        refresh = partial(refresh_hidden, sub_controller, refresh_steps, read_last_observation=reads_last)
+    relabel, root_extra, next_extra = None, [], []
+    if sub_hindsight:
+        relabel = partial(
+            relabel_subgoals,
+            num_subgoals=num_subgoals,
+            hazard_reward=hazard_reward,
+            wrong_subgoal_reward=wrong_subgoal_reward,
+        )
+        root_extra, next_extra = [keys.SUBGOAL_MASK], [keys.ATTAINED, keys.HAZARD]
     policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
     sub_learner = Learner(
         sub_controller,
         sub,
         extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT, *stored_states(sub_controller, sub)],
-            next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED],
+            root_keys=[
+                keys.OBSERVATION,
+                keys.ACTION,
+                keys.OPTION_INIT,
+                *stored_states(sub_controller, sub),
+                *root_extra,
+            ],
+            next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED, *next_extra],
             subgoal_key=keys.SUBGOAL,
         ),
         loss=make_recurrent_loss(
@@ -262,19 +303,22 @@ def make_hdrqn(
                 "done": keys.OPTION_DONE,
                 "terminated": keys.OPTION_TERMINATED,
                 "init": keys.OPTION_INIT,
+                "eligible": keys.ELIGIBLE if sub_hindsight else None,
             },
         ),
         num_envs=env.batch_size[0],
+        refresh=relabel,
     )
     meta_learner = Learner(
         meta_controller,
         meta,
-        extract=OptionExtractor(
+        extract=_option_extract(
             input_keys=meta_keys,
             mask_key=mask_key,
             at_end=partial(_read_last, sub_controller) if reads_last else None,
             state_keys=stored_states(meta_controller, meta),
-            history=history,
+            history_steps=refresh_steps,
+            hindsight_gamma=option_gamma if meta_hindsight else None,
         ),
         loss=make_recurrent_loss(
             meta_controller,
@@ -293,7 +337,7 @@ def make_hdrqn(
     def make_transforms() -> Compose:
         subgoals = SubgoalTransform(
             num_subgoals,
-            gamma=gamma if smdp_discount else 1.0,
+            gamma=option_gamma,
             max_option_steps=max_option_steps,
             hazard_reward=hazard_reward,
             wrong_subgoal_reward=wrong_subgoal_reward,
@@ -447,6 +491,32 @@ def make_v3(
         explorations={"sub": sub_exploration, "meta": meta_exploration},
         make_transforms=make_transforms,
     )
+
+
+def _option_extract(
+    *,
+    input_keys: list[str],
+    mask_key: str | None,
+    at_end: Callable[[TensorDictBase], TensorDictBase] | None,
+    state_keys: list[NestedKey],
+    history_steps: int | None,
+    hindsight_gamma: float | None,
+) -> Extract:
+    """Where the meta level's transitions come from: options as they were or, given a discount, in hindsight, too."""
+
+    def extractor(active_subgoal_key: str = keys.ACTIVE_SUBGOAL) -> OptionExtractor:
+        return OptionExtractor(
+            input_keys=input_keys,
+            mask_key=mask_key,
+            active_subgoal_key=active_subgoal_key,
+            at_end=at_end,
+            state_keys=state_keys,
+            history=None if history_steps is None else OptionHistory(history_steps),
+        )
+
+    if hindsight_gamma is None:
+        return extractor()
+    return HindsightOptions(extractor(), extractor(keys.HINDSIGHT_SUBGOAL), gamma=hindsight_gamma, at_start=at_end)
 
 
 @torch.no_grad()

@@ -37,6 +37,10 @@ OPTION_DONE = "option_done"  # [1] bool
 OPTION_TERMINATED = "option_terminated"  # [1] bool
 INTRINSIC_REWARD = "intrinsic_reward"  # [1] float32: r^in
 
+# Written by hindsight (data/hindsight.py).
+ELIGIBLE = "eligible"  # [1] bool: the step may enter the loss
+HINDSIGHT_SUBGOAL = "hindsight_subgoal"  # [] int64: the subgoal that an option attained or, failing that, pursued
+
 # TorchRL's own.
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 TRAJ_IDS = ("collector", "traj_ids")

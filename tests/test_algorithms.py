@@ -26,9 +26,12 @@ NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
         ("v2", {"meta_input": "cell"}),
         ("v2", {"meta_input": "both"}),
         ("v2", {"meta_input_time": "after_last_observation"}),
+        ("hdqn", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v1", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v2", {"sub_hindsight": True, "meta_hindsight": True}),
         ("v3", {}),
     ],
-    ids=lambda value: value if isinstance(value, str) else "-".join(value.values()),
+    ids=lambda value: value if isinstance(value, str) else "-".join(str(option) for option in value.values()),
 )
 def test_every_algorithm_collects_and_updates_each_level(name, options, network, layout):
     torch.manual_seed(0)
@@ -44,6 +47,28 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
         metrics = learner.update(learner.sample())
         assert metrics["loss"] > 0 and metrics["trained_steps"] > 0
         assert any((p != old).any() for p, old in zip(learner.network.parameters(), before, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "message"),
+    [
+        (
+            {"n_step": 2},
+            {"sub_hindsight": True},
+            r"sub\.n_step must be 1 with sub_hindsight=True, got 2",
+        ),
+        ({"stored_state": True}, {"sub_hindsight": True}, r"sub\.stored_state must be False with sub_hindsight=True"),
+        (
+            {"stored_state": True},
+            {"meta_hindsight": True},
+            r"meta\.stored_state must be False with meta_",
+        ),
+    ],
+    ids=["n_step", "sub-states", "meta-states"],
+)
+def test_what_hindsight_does_not_go_with(settings, options, message):
+    with pytest.raises(ValueError, match=message):
+        build("v2", small_env(4), settings=tiny_settings(**settings), **options)
 
 
 @pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])

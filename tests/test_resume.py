@@ -23,6 +23,12 @@ TRAININGS = {
     ),
     "v2": partial(make_training, name="v2"),
     "v2-refreshed": partial(make_training, name="v2", options={"refresh_hidden_steps": 7}),
+    "v2-hindsight": partial(
+        make_training,
+        name="v2",
+        learner={"trace_decay": 0.5},
+        options={"sub_hindsight": True, "meta_hindsight": True, "meta_input_time": "after_last_observation"},
+    ),
     "v3": partial(make_training, name="v3"),
 }
 
@@ -132,7 +138,7 @@ def memory_for_disk():
 
 FEW = ("between two updates", "in the middle of options", "with full memories")
 PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
-PAIRS += [(training, cut) for training in ("v2-refreshed", "v3") for cut in FEW]
+PAIRS += [(training, cut) for training in ("v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
 
 
 @pytest.fixture(scope="module")

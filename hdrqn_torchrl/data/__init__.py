@@ -1,5 +1,6 @@
 """From collected steps to replayed sequences."""
 
+from hdrqn_torchrl.data.hindsight import HindsightOptions, relabel_subgoals
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
 from hdrqn_torchrl.data.replay import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
@@ -8,6 +9,7 @@ from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, W
 __all__ = [
     "FROM_STARTS",
     "EpisodeStartSampler",
+    "HindsightOptions",
     "OptionExtractor",
     "OptionHistory",
     "Sampling",
@@ -16,5 +18,6 @@ __all__ = [
     "WholeEpisodeSampler",
     "make_sequence_buffer",
     "refresh_hidden",
+    "relabel_subgoals",
     "sample_sequences",
 ]

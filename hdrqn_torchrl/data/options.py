@@ -70,6 +70,7 @@ class OptionExtractor:
         self.init_key, self.traj_key, self.option_steps_key = init_key, traj_key, option_steps_key
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
         self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
+        self.option_return_key, self.input_keys = option_return_key, list(input_keys)
         inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
         self._start_keys = [*inputs, *state_keys, init_key, traj_key]
         self._end_keys = [*inputs, option_steps_key, option_return_key, keys.DONE, keys.TERMINATED, keys.TRUNCATED]

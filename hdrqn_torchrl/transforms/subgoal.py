@@ -121,10 +121,8 @@ class SubgoalTransform(Transform):
             init.squeeze(-1), tensordict.get(self.subgoal_key), tensordict.get(self.active_subgoal_key)
         )
         chosen = subgoal.unsqueeze(-1)
-        steps = tensordict.get(self.option_steps_key).masked_fill(init, 0)
-        collected = tensordict.get(self.option_return_key).masked_fill(init, 0.0)
-        collected = collected + self.gamma**steps * next_tensordict.get(self.extrinsic_reward_key)
-        steps = steps + 1
+        book = tensordict.get(self.option_steps_key), tensordict.get(self.option_return_key)
+        steps, collected = advance_option(init, *book, next_tensordict.get(self.extrinsic_reward_key), self.gamma)
 
         attained = next_tensordict.get(self.attained_key) if self.critic is None else self.critic(next_tensordict)
         reached = attained.gather(-1, chosen)
@@ -150,13 +148,15 @@ class SubgoalTransform(Transform):
         return next_tensordict
 
     def _intrinsic_reward(self, attained: Tensor, reached: Tensor, next_tensordict: TensorDictBase) -> Tensor:
-        reward = self.reached_reward * reached.float()
-        if self.hazard_key is not None and self.hazard_reward:
-            reward = reward + self.hazard_reward * next_tensordict.get(self.hazard_key).float()
-        if self.wrong_subgoal_reward:
-            others = attained.sum(-1, keepdim=True) > reached.long()
-            reward = reward + self.wrong_subgoal_reward * others.float()
-        return reward
+        reads_hazard = self.hazard_key is not None and self.hazard_reward
+        return intrinsic_reward(
+            attained,
+            reached,
+            next_tensordict.get(self.hazard_key) if reads_hazard else None,
+            reached_reward=self.reached_reward,
+            hazard_reward=self.hazard_reward,
+            wrong_subgoal_reward=self.wrong_subgoal_reward,
+        )
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         reset = tensordict.get("_reset", None)
@@ -218,6 +218,59 @@ class SubgoalTransform(Transform):
             _set_spec(input_spec["full_state_spec"], key, specs[key])
         _set_spec(input_spec["full_action_spec"], self.subgoal_key, specs[self.active_subgoal_key].clone())
         return input_spec
+
+
+def advance_option(
+    init: Tensor, steps: Tensor, collected: Tensor, reward: Tensor, gamma: float
+) -> tuple[Tensor, Tensor]:
+    """The book of an option after one more step: rule 4 of :class:`SubgoalTransform`.
+
+    Args:
+        init: whether the step is the option's first, ``[*, 1]`` bool; then what stood in the book is void.
+        steps, collected: how long the option has lasted and what it has collected, ``[*, 1]``.
+        reward: extrinsic reward of the step, ``[*, 1]``.
+        gamma: discount inside an option.
+
+    Returns:
+        ``steps`` and ``collected`` after the step.
+    """
+    steps = steps.masked_fill(init, 0)
+    return steps + 1, collected.masked_fill(init, 0.0) + gamma**steps * reward
+
+
+def intrinsic_reward(
+    attained: Tensor,
+    reached: Tensor,
+    hazard: Tensor | None,
+    *,
+    reached_reward: float = 1.0,
+    hazard_reward: float = -1.0,
+    wrong_subgoal_reward: float = 0.0,
+) -> Tensor:
+    """The critic's reward of a step, for any subgoal: rule 3 of :class:`SubgoalTransform`.
+
+    Args:
+        attained: subgoals that the step attained, ``[*, G]`` bool.
+        reached: whether the one in question is among them, ``[*, 1]`` bool.
+        hazard: whether the step met the hazard, ``[*, 1]`` bool; ``None``: there is none.
+        reached_reward, hazard_reward, wrong_subgoal_reward: as in :class:`SubgoalTransform`.
+
+    Returns:
+        ``[*, 1]``.
+
+    Examples:
+        >>> attained, reached = torch.tensor([[False, True]] * 2), torch.tensor([[True], [False]])
+        >>> intrinsic_reward(attained, reached, None, wrong_subgoal_reward=-0.5)
+        tensor([[ 1.0000],
+                [-0.5000]])
+    """
+    reward = reached_reward * reached.float()
+    if hazard is not None and hazard_reward:
+        reward = reward + hazard_reward * hazard.float()
+    if wrong_subgoal_reward:
+        others = attained.sum(-1, keepdim=True) > reached.long()
+        reward = reward + wrong_subgoal_reward * others.float()
+    return reward
 
 
 def _set_spec(composite: Composite, key: NestedKey, spec: TensorSpec) -> None:
