@@ -7,7 +7,7 @@ the sub level :func:`relabel_subgoals` shows each replayed sequence once for eve
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -26,6 +26,7 @@ def relabel_subgoals(
     reached_reward: float = 1.0,
     hazard_reward: float = -1.0,
     wrong_subgoal_reward: float = 0.0,
+    state_keys: Sequence[NestedKey] = (),
     subgoal_key: NestedKey = keys.SUBGOAL,
     attained_key: NestedKey = keys.ATTAINED,
     hazard_key: NestedKey = keys.HAZARD,
@@ -41,9 +42,9 @@ def relabel_subgoals(
     Told for another subgoal g than the one pursued at its first step, a sequence differs as acting would have:
 
     - g is in force throughout, and reward and termination of each step are those of g;
-    - reaching g ends the option. Reaching the subgoal that was really pursued, or that having become impossible, does
-      not, so there the recurrent state goes on; to cut the sequence there would leave out steps *because* of what they
-      attained, which biases values. Every other end (of the episode, by a time limit) is one for g, too;
+    - the option ends where g is reached. That the subgoal really pursued was reached, or could not be any more, is no
+      end for g, so there the recurrent state goes on; to cut the sequence there would leave out steps *because* of
+      what they attained, which biases values. Every other end (episode, time limit) is one for g, too;
     - where g could not be chosen any more, since it had been attained before, a step is not eligible for the loss.
       The next eligible one starts an episode, so these steps reach no target and no state that is trained.
 
@@ -51,6 +52,8 @@ def relabel_subgoals(
         sample: sequences ``[B, T]`` of the sub level with ``attained``, ``hazard`` and ``subgoal_mask``.
         num_subgoals: G.
         reached_reward, hazard_reward, wrong_subgoal_reward: as in :class:`~hdrqn_torchrl.transforms.SubgoalTransform`.
+        state_keys: recurrent states stored with the steps, if any. They come from the subgoal that was pursued; told
+            for another one, a sequence starts from zero.
         subgoal_key: subgoal in force, at the root and under ``"next"``.
         attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``.
         mask_key, option_init_key: at the root.
@@ -91,6 +94,8 @@ def relabel_subgoals(
         part.set(key, torch.where(shift > 0, value, part.get(key)))
     for part in (told, after):
         part.set(subgoal_key, subgoal.squeeze(-1))
+    for key in state_keys:
+        told.set(key, told.get(key).masked_fill(shift > 0, 0.0))
     return told.set(eligible_key, (shift == 0) | left.gather(-1, subgoal))
 
 
@@ -104,7 +109,7 @@ class HindsightOptions:
     which every option attained its own subgoal or none are not told again. The others follow as trajectories of their
     own, numbered :math:`-1 - n` for the episode :math:`n`, so that no sequence mixes the two.
 
-    Such options have always attained something: what is learned of a subgoal leans towards its being reached.
+    Told options have always attained something: what is learned of a choice leans towards its success.
 
     Args:
         pursued: extracts the options as they were.

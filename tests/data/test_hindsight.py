@@ -166,6 +166,12 @@ class TestRelabelSubgoals:
         assert [shown(row)["reward"][1] for row in found] == [0.0, 0.0, 2.0, 2.0, -0.25, -0.25]
         assert [shown(row)["terminated"] for row in found] == ["", "", "1", "1", "", ""]
 
+    def test_a_stored_state_is_that_of_the_subgoal_that_was_pursued(self):
+        sample = sequence(**ON_THE_WAY)
+        sample["hidden"] = torch.rand(1, 4, 3)
+        kept, told = relabel_subgoals(sample, 2, state_keys=["hidden"])["hidden"]
+        assert torch.equal(kept, sample["hidden"][0]) and not told.any()
+
     def test_one_subgoal_is_left_alone(self):
         played = {"pursued": "00", "attained": "0 1", "mask": "1 1", "init": "0", "done": "1", "terminated": "1"}
         sample = sequence(**played, reward=[0.0, 1.0])
