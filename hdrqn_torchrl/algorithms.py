@@ -241,11 +241,12 @@ def make_hdrqn(
         history = OptionHistory(refresh_hidden_steps)
         refresh = partial(refresh_hidden, sub_controller, refresh_hidden_steps, read_last_observation=reads_last)
     policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
+    starts = [keys.IS_INIT] if sub.sampling in FROM_STARTS else []
     sub_learner = Learner(
         sub_controller,
         sub,
         extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT, *stored_states(sub_controller, sub)],
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.OPTION_INIT, *starts, *stored_states(sub_controller, sub)],
             next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED],
             subgoal_key=keys.SUBGOAL,
         ),

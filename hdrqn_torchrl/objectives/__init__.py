@@ -4,8 +4,10 @@ from hdrqn_torchrl.objectives.all_subgoals import AllSubgoalsLoss
 from hdrqn_torchrl.objectives.recurrent_dqn import RecurrentDQNLoss
 from hdrqn_torchrl.objectives.targets import (
     double_q_value,
+    importance_weight,
     lambda_returns,
     n_step_returns,
+    sequence_priority,
     smdp_target,
     training_mask,
     watkins_trace,
@@ -15,8 +17,10 @@ __all__ = [
     "AllSubgoalsLoss",
     "RecurrentDQNLoss",
     "double_q_value",
+    "importance_weight",
     "lambda_returns",
     "n_step_returns",
+    "sequence_priority",
     "smdp_target",
     "training_mask",
     "watkins_trace",

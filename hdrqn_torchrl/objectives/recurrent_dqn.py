@@ -17,7 +17,13 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.objectives.targets import double_q_value, smdp_target, training_mask
+from hdrqn_torchrl.objectives.targets import (
+    double_q_value,
+    importance_weight,
+    sequence_priority,
+    smdp_target,
+    training_mask,
+)
 
 
 class RecurrentDQNLoss(LossModule):
@@ -55,10 +61,11 @@ class RecurrentDQNLoss(LossModule):
 
     Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
     ``steps`` (under ``"next"``, ``None``: 1); ``init`` (restart of the state); ``mask`` (padding);
-    ``action_mask`` (choices that exist, ``None``: all).
+    ``action_mask`` (choices that exist, ``None``: all); ``priority_weight`` (of sequences drawn by priority).
 
     Returns (``forward``): ``loss`` (scalar), and without gradient ``td_error`` (mean absolute), ``q_value`` and
-    ``target`` (means), ``trained_steps`` (how many steps entered the loss).
+    ``target`` (means), ``trained_steps`` (how many steps entered the loss), ``priority`` (of each
+    sequence, ``[B]``; see :func:`~hdrqn_torchrl.objectives.sequence_priority`).
 
     Examples:
         >>> from hdrqn_torchrl.modules import CellFeatures, QNetwork, SubController
@@ -82,6 +89,7 @@ class RecurrentDQNLoss(LossModule):
         steps: NestedKey | None = None
         init: NestedKey = keys.IS_INIT
         mask: NestedKey = keys.PAD_MASK
+        priority_weight: NestedKey = "priority_weight"
         action_mask: NestedKey | None = None
 
     tensor_keys: _AcceptedKeys
@@ -91,7 +99,7 @@ class RecurrentDQNLoss(LossModule):
     target_value_network: TensorDictModuleBase
     target_value_network_params: TensorDictParams
     gamma: Tensor
-    out_keys = ["loss", "td_error", "q_value", "target", "trained_steps"]
+    out_keys = ["loss", "td_error", "q_value", "target", "trained_steps", "priority"]
 
     def __init__(
         self,
@@ -174,13 +182,17 @@ class RecurrentDQNLoss(LossModule):
             trained = trained & ~_ends_unseen(done & ~terminated, valid)
             count = trained.sum().clamp(min=1)
             wanted = torch.where(trained, wanted, chosen)
-        loss = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0).sum() / count
+        distance = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0)
+        if (weight := tensordict.get(k.priority_weight, None)) is not None:
+            distance = distance * importance_weight(weight).unsqueeze(-1)
+        loss = distance.sum() / count
         with torch.no_grad():
             report = {
                 "td_error": (wanted - chosen).abs().masked_fill(~trained, 0.0).sum() / count,
                 "q_value": chosen.detach().masked_fill(~trained, 0.0).sum() / count,
                 "target": wanted.masked_fill(~trained, 0.0).sum() / count,
                 "trained_steps": trained.sum(),
+                "priority": sequence_priority(wanted - chosen, trained),
             }
         return TensorDict({"loss": loss, **report}, [])
 
