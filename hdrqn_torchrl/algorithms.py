@@ -220,7 +220,7 @@ def make_hdrqn(
 
     Raises:
         ValueError: if ``version`` or ``meta_input`` is unknown, v2 is asked for without recurrence, or
-            hindsight with n-step targets (sub level) or stored states.
+            hindsight with n-step targets or priorities (sub level) or with stored states.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -241,6 +241,11 @@ def make_hdrqn(
         raise ValueError(
             f"sub.n_step must be 1 with sub_hindsight=True, got {sub.n_step}: later actions pursued another subgoal; "
             "use sub.trace_decay, which looks on only while actions are the greedy ones for the subgoal in question."
+        )
+    if sub_hindsight and sub.priority_exponent is not None:
+        raise ValueError(
+            f"sub.priority_exponent must be None with sub_hindsight=True, got {sub.priority_exponent}: a sequence has "
+            "an error for every subgoal it is told for, and one priority."
         )
     for level, settings, hindsight in (("sub", sub, sub_hindsight), ("meta", meta, meta_hindsight)):
         if settings.stored_state and hindsight:
@@ -280,6 +285,7 @@ def make_hdrqn(
         )
         root_extra, next_extra = [keys.SUBGOAL_MASK], [keys.ATTAINED, keys.HAZARD]
     policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
+    starts = [keys.IS_INIT] if sub.sampling in FROM_STARTS else []
     sub_learner = Learner(
         sub_controller,
         sub,
@@ -288,6 +294,7 @@ def make_hdrqn(
                 keys.OBSERVATION,
                 keys.ACTION,
                 keys.OPTION_INIT,
+                *starts,
                 *stored_states(sub_controller, sub),
                 *root_extra,
             ],

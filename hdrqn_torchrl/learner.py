@@ -58,6 +58,9 @@ class LearnerSettings:
         stored_state: store the recurrent state that acting had at each step, and let sequences that begin in
             mid-episode start from it instead of from zero (R2D2; Kapturowski et al., 2019). Costs 8 H bytes a step.
         sampling: how sequences are drawn (see :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
+        priority_exponent: alpha: draw sequences in proportion to ``priority**alpha``, where the priority is what the
+            loss reports; R2D2 has 0.9. ``None``: all alike.
+        importance_exponent: beta: weights ``priority**(-alpha * beta)`` make up for it in the loss; 1: in full.
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be, if known; targets are cut off above it.
@@ -82,6 +85,8 @@ class LearnerSettings:
     train_exact_states: bool = True
     stored_state: bool = False
     sampling: Sampling = "steps"
+    priority_exponent: float | None = None
+    importance_exponent: float = 0.6
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
     max_target: float | None = None
@@ -117,6 +122,13 @@ class LearnerSettings:
                 f"False with sampling={self.sampling!r}",
                 "all its sequences begin where an episode does, and there the state is zero",
             ),
+            (
+                "priority_exponent",
+                self.priority_exponent is None or 0 < self.priority_exponent <= 1,
+                "in (0, 1] or None",
+                "use 0.9, or None to draw all alike",
+            ),
+            ("importance_exponent", 0 <= self.importance_exponent <= 1, "in [0, 1]", "use 0.6"),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
             (
                 "n_step",
@@ -150,7 +162,8 @@ class Learner:
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
         refresh: applied to every minibatch before it is learned from.
         samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
-            and one large draw costs little more than a small one.
+            and one large draw costs little more than a small one. Priorities are those of
+            the draw: up to ``samples_per_draw - 1`` updates old.
 
     Examples:
         See :func:`hdrqn_torchrl.algorithms.make_drqn`, which builds one.
@@ -170,6 +183,8 @@ class Learner:
     ) -> None:
         self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
         self.loss = loss
+        if settings.priority_exponent is not None and "priority" not in loss.out_keys:
+            raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
         self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
         self._parameters = list(network.parameters())
         self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, fused=True)
@@ -180,6 +195,8 @@ class Learner:
             batch_size=settings.batch_size * samples_per_draw,
             num_envs=num_envs,
             sampling=settings.sampling,
+            priority_exponent=settings.priority_exponent,
+            importance_exponent=settings.importance_exponent,
             device=self._parameters[0].device,
         )
         self._drawn: list[TensorDictBase] = []
@@ -229,6 +246,7 @@ class Learner:
             NonFiniteError: if loss or gradient is; the weights are as they were.
         """
         metrics = dict(self.loss(sample).items())
+        priority = metrics.pop("priority", None)
         self.optimizer.zero_grad()
         metrics["loss"].backward()
         gradients = [parameter.grad for parameter in self._parameters if parameter.grad is not None]
@@ -241,6 +259,8 @@ class Learner:
         self.optimizer.step()
         self.target_updater.step()
         self.updates += 1
+        if self.settings.priority_exponent is not None:
+            self.buffer.update_priority(sample["index"][:, 0], priority)
         return {name: value.detach() for name, value in metrics.items()}
 
     def _explain_non_finite(self, loss: Tensor) -> str:

@@ -1,12 +1,13 @@
 from copy import deepcopy
+from functools import partial
 
 import pytest
 import torch
 from helpers import ALGORITHMS, build, collect, make_collector, parameter_distance, small_env, tiny_settings
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
-from hdrqn_torchrl.algorithms import V3_LEARNER, make_hdqn, make_hdrqn, make_v3
-from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.algorithms import V3_LEARNER, make_drqn, make_hdqn, make_hdrqn, make_v3
+from hdrqn_torchrl.data import FROM_STARTS, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
 
@@ -57,6 +58,11 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
             {"sub_hindsight": True},
             r"sub\.n_step must be 1 with sub_hindsight=True, got 2",
         ),
+        (
+            {"priority_exponent": 0.9},
+            {"sub_hindsight": True},
+            r"sub\.priority_exponent must be None with sub_",
+        ),
         ({"stored_state": True}, {"sub_hindsight": True}, r"sub\.stored_state must be False with sub_hindsight=True"),
         (
             {"stored_state": True},
@@ -64,7 +70,7 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
             r"meta\.stored_state must be False with meta_",
         ),
     ],
-    ids=["n_step", "sub-states", "meta-states"],
+    ids=["n_step", "priorities", "sub-states", "meta-states"],
 )
 def test_what_hindsight_does_not_go_with(settings, options, message):
     with pytest.raises(ValueError, match=message):
@@ -311,6 +317,48 @@ def test_a_collector_carries_options_and_states_from_batch_to_batch(name, states
         assert (second[key][:, 0] == first["next", key][:, -1])[going_on].all(), key
 
 
+FLAT = [{"sampling": sampling} for sampling in ("steps", "episodes", "episode_starts", "whole_episodes")]
+PRIORITISED = [{**settings, "priority_exponent": 0.9} for settings in FLAT if settings["sampling"] != "episodes"]
+STARTS = [settings for settings in FLAT + PRIORITISED if settings["sampling"] in FROM_STARTS]
+STORED = [{**settings, "stored_state": True} for settings in FLAT + PRIORITISED if settings not in STARTS]
+OPTIONS = [settings for settings in FLAT + PRIORITISED + STORED if settings["sampling"] != "episode_starts"]
+
+
+class TestSequences:
+    """Every way to draw sequences, with every level that takes it."""
+
+    @pytest.mark.parametrize("settings", FLAT + PRIORITISED + STORED, ids=str)
+    @pytest.mark.parametrize("name", ["drqn", "v1"])
+    def test_of_steps(self, name, settings):
+        level = {"drqn": "learner", "v1": "sub"}[name]
+        make = {"drqn": make_drqn, "v1": partial(make_hdrqn, version="v1")}[name]
+        self.check(make, level, settings)
+
+    @pytest.mark.parametrize("settings", OPTIONS, ids=str)
+    def test_of_options(self, settings):
+        self.check(make_hdrqn, "meta", settings)
+
+    @pytest.mark.parametrize("settings", STARTS + STORED, ids=str)
+    def test_of_v3(self, settings):
+        self.check(make_v3, "learner", settings)
+
+    def check(self, make, level, settings):
+        torch.manual_seed(0)
+        env = small_env(8)
+        learner_settings = tiny_settings(batch_size=16, **settings)
+        algorithm = make(env, NETWORKS["compact"], **{level: learner_settings})
+        learner = algorithm.learners["meta" if level == "meta" else next(iter(algorithm.learners))]
+        for batch in collect(algorithm, env, 10, batches=3):
+            learner.store(batch)
+            if len(learner.buffer):
+                metrics = learner.update(learner.sample())
+        assert metrics["trained_steps"] > 0 and all(torch.isfinite(value) for value in metrics.values())
+        sample = learner.sample()
+        if settings in STARTS:
+            assert sample["is_init"][:, 0].all()
+        assert ("priority_weight" in sample) == ("priority_exponent" in settings)
+
+
 STATES = {
     ("drqn", "flat"): ["sub_hidden", "sub_cell"],
     ("v1", "sub"): ["sub_hidden", "sub_cell"],
@@ -371,7 +419,7 @@ class TestV3:
             assert moved > 0 or name.startswith("memory.bias_hh"), name
             torch.testing.assert_close(target[name], before[name].lerp(parameter.detach(), 0.25), msg=name)
         assert not any(value.requires_grad for value in metrics.values())
-        assert set(metrics) == set(learner.loss.out_keys)
+        assert set(metrics) == set(learner.loss.out_keys) - {"priority"}
 
     def test_a_sequence_has_one_step_more_than_are_trained(self):
         algorithm, batch = self.steps(learner={"slice_len": 5, "batch_size": 3})

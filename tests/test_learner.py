@@ -140,6 +140,72 @@ class TestUpdate:
         assert parameter_distance(before, meta.loss.value_network_params.data) == 0
 
 
+class TestPriorities:
+    def errors_of(self, learner, sample):
+        with torch.no_grad():
+            return learner.loss(sample)["priority"]
+
+    def test_an_update_writes_those_of_its_minibatch_and_of_no_other(self):
+        """As they were before its gradient step, at the first steps of its sequences."""
+        learner = make_learner(priority_exponent=1.0, slice_len=2, batch_size=3, learning_rate=0.5)
+        learner.store(make_batch())
+        sample, other = learner.sample(), learner.sample()
+        expected = self.errors_of(learner, sample)
+        metrics = learner.update(sample)
+        assert "priority" not in metrics and all(value.ndim == 0 for value in metrics.values())
+        found = self.stored(learner, sample)
+        torch.testing.assert_close(found, expected)
+        starts = sample["index"][:, 0].tolist()
+        others = [row for row, start in enumerate(other["index"][:, 0].tolist()) if start not in starts]
+        assert others and (self.stored(learner, other)[others] == 1.0).all()
+        assert learner.buffer.sampler.state_dict()["starts"].sum() == 16
+
+    def stored(self, learner, sample):
+        """Priorities that the memory has of the sequences of a sample."""
+        time, env = sample["index"][:, 0].unbind(-1)
+        return learner.buffer.sampler.state_dict()["priorities"][time * 2 + env] - 1e-3
+
+    def test_what_has_been_learned_is_shown_less(self):
+        torch.manual_seed(0)
+        learner = make_learner(priority_exponent=1.0, slice_len=4, batch_size=8, samples_per_draw=1)
+        batch = make_batch(num_envs=2)
+        batch["next", "reward"].zero_()
+        batch["next", "reward"][0, :4] = 30.0  # what this episode pays can't be learned soon
+        learner.store(batch)
+        shown = torch.cat([self.learn(learner) for _ in range(40)][10:])
+        assert (shown == 0).float().mean() > 0.8
+        uniform = make_learner(slice_len=4, batch_size=8, samples_per_draw=1)
+        uniform.store(batch)
+        assert (torch.cat([self.learn(uniform) for _ in range(40)]) == 0).float().mean() < 0.4
+
+    def learn(self, learner):
+        sample = learner.sample()
+        learner.update(sample)
+        return sample["collector", "traj_ids"][:, 0]
+
+    def test_the_weights_reach_the_loss(self):
+        losses = []
+        for importance_exponent in (0.0, 1.0):
+            learner = make_learner(
+                priority_exponent=1.0, importance_exponent=importance_exponent, slice_len=4, batch_size=32
+            )
+            learner.store(make_batch())
+            for _ in range(20):
+                sample = learner.sample()
+                metrics = learner.update(sample)
+            losses.append((metrics["loss"] < learner.loss(sample.exclude("priority_weight"))["loss"]).item())
+            assert (sample["priority_weight"] == 1.0).all() == (importance_exponent == 0.0)
+        assert losses[1]
+
+    def test_a_loss_that_reports_none_is_refused(self):
+        learner = make_learner()
+        learner.loss.out_keys = ["loss"]
+        with pytest.raises(ValueError, match="priority_exponent must be None for RecurrentDQNLoss, which reports no"):
+            Learner(
+                learner.network, tiny_settings(priority_exponent=0.9), extract=Keep(), loss=learner.loss, num_envs=2
+            )
+
+
 class TestLearningRate:
     def test_it_falls_linearly_and_then_stays(self):
         learner = make_learner(learning_rate=1e-2, learning_rate_end=2e-3, learning_rate_frames=64)
@@ -204,6 +270,10 @@ class TestSettings:
             ("tau", 0.0, r"in \(0, 1\]"),
             ("tau", 1.5, r"in \(0, 1\]"),
             ("max_grad_norm", 0.0, "> 0 or None"),
+            ("priority_exponent", 0.0, r"in \(0, 1\] or None"),
+            ("priority_exponent", 1.5, r"in \(0, 1\] or None"),
+            ("importance_exponent", -0.1, r"in \[0, 1\]"),
+            ("importance_exponent", 1.1, r"in \[0, 1\]"),
         ],
     )
     def test_wrong_values_are_refused_when_set(self, name, value, rule):
@@ -303,13 +373,15 @@ class Keep:
 
 
 class TestState:
-    def test_a_copy_goes_on_alike(self):
+    @pytest.mark.parametrize("priority_exponent", [None, 0.9])
+    def test_a_copy_goes_on_alike(self, priority_exponent):
         """In the middle of the minibatches of one draw, after a first transition that came late."""
         settings = {
             "learning_rate": 0.05,
             "learning_rate_end": 1e-3,
             "learning_rate_frames": 200,
             "frames_per_update": 4,
+            "priority_exponent": priority_exponent,
         }
         first, second = (make_learner(extract=Keep(), capacity=24, **settings) for _ in range(2))
         torch.manual_seed(1)
@@ -319,7 +391,9 @@ class TestState:
         for _ in range(3):
             first.update(first.sample())
         torch.manual_seed(7)
-        second.update(make_batch())  # it has other weights and another optimiser
+        second.store(make_batch())
+        second.store(make_batch())
+        second.update(second.sample())  # it has other weights and another optimiser
         second.load_state_dict(deepcopy(first.state_dict()))  # torch's optimiser keeps what it is given
         assert second.updates_due() == first.updates_due() == 5
         losses = []

@@ -63,20 +63,20 @@ def test_drqn_learns_what_takes_memory():
 
 
 @pytest.mark.slow
-def test_v3_solves_a_small_room():
+@pytest.mark.parametrize(
+    "sequences",
+    [
+        {"sampling": "episode_starts", "slice_len": 16, "batch_size": 16},
+        {"sampling": "steps", "slice_len": 8, "stored_state": True, "burn_in": 0.25, "priority_exponent": 0.9},
+    ],
+    ids=["exact states", "R2D2"],
+)
+def test_v3_solves_a_small_room(sequences):
     """In two thirds of v2's frames; with view 3 it has to remember what it passed."""
     torch.manual_seed(0)
     env = small_env(32, **TASK)
-    learner = tiny_settings(
-        slice_len=16,
-        batch_size=16,
-        capacity=50_000,
-        warmup_frames=2_000,
-        learning_rate=3e-3,
-        tau=0.02,
-        max_grad_norm=10.0,
-        sampling="episode_starts",
-    )
+    usual = {"capacity": 50_000, "warmup_frames": 2_000, "learning_rate": 3e-3, "tau": 0.02, "max_grad_norm": 10.0}
+    learner = tiny_settings(**({"batch_size": 32} | usual | sequences))
     algorithm = make_v3(
         env,
         compact_network(32, (64,)),

@@ -30,6 +30,16 @@ TRAININGS = {
         options={"sub_hindsight": True, "meta_hindsight": True, "meta_input_time": "after_last_observation"},
     ),
     "v3": partial(make_training, name="v3"),
+    "drqn-r2d2": partial(make_training, name="drqn", learner={"stored_state": True, "priority_exponent": 0.9}),
+    "v1-r2d2": partial(
+        make_training, name="v1", learner={"stored_state": True, "priority_exponent": 0.9, "slice_len": 2}
+    ),
+    "v2-whole": partial(make_training, name="v2", learner={"sampling": "whole_episodes", "priority_exponent": 0.5}),
+    "v3-r2d2": partial(
+        make_training,
+        name="v3",
+        learner={"sampling": "steps", "stored_state": True, "priority_exponent": 0.9, "burn_in": 0.25, "slice_len": 4},
+    ),
 }
 
 
@@ -139,6 +149,8 @@ def memory_for_disk():
 FEW = ("between two updates", "in the middle of options", "with full memories")
 PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
 PAIRS += [(training, cut) for training in ("v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
+PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole"))]
+PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
 
 
 @pytest.fixture(scope="module")

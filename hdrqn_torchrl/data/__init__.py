@@ -3,6 +3,7 @@
 from hdrqn_torchrl.data.hindsight import HindsightOptions, relabel_subgoals
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
+from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
 from hdrqn_torchrl.data.replay import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
 
@@ -12,6 +13,7 @@ __all__ = [
     "HindsightOptions",
     "OptionExtractor",
     "OptionHistory",
+    "PrioritizedSequenceSampler",
     "Sampling",
     "StepSelector",
     "StepSliceSampler",

@@ -7,8 +7,10 @@ from typing import Any, Literal
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from torchrl.data.replay_buffers import Sampler
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
 from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
 
 Sampling = Literal["steps", "episodes", "episode_starts", "whole_episodes"]
@@ -48,6 +50,8 @@ def make_sequence_buffer(
     batch_size: int,
     num_envs: int | None = None,
     sampling: Sampling = "steps",
+    priority_exponent: float | None = None,
+    importance_exponent: float = 0.6,
     traj_key: NestedKey = keys.TRAJ_IDS,
     device: torch.device | str = "cpu",
 ) -> TensorDictReplayBuffer:
@@ -67,6 +71,8 @@ def make_sequence_buffer(
             ``"episode_starts"``: from the start of a random episode on, and into the next ones
             (:class:`EpisodeStartSampler`); ``"whole_episodes"``: the same, padded after the episode's end
             (:class:`WholeEpisodeSampler`).
+        priority_exponent, importance_exponent: draw sequences by priority, see :class:`PrioritizedSequenceSampler`;
+            ``None``: all alike.
         traj_key: entry that numbers the episodes.
         device: device of the storage.
 
@@ -91,9 +97,24 @@ def make_sequence_buffer(
         )
     if sampling == "episode_starts" and num_envs is None:
         raise ValueError("sampling must be 'steps', 'episodes' or 'whole_episodes' for rows, got 'episode_starts'.")
+    sampler: Sampler = _make_sampler(sampling, slice_len, traj_key)
+    if priority_exponent is not None:
+        if sampling == "episodes":
+            raise ValueError(
+                "sampling must be 'steps', 'episode_starts' or 'whole_episodes' with priority_exponent, got "
+                "'episodes', which picks an episode first."
+            )
+        sampler = PrioritizedSequenceSampler(
+            -(-capacity // (num_envs or 1)) * (num_envs or 1),  # as many as the storage will hold
+            slice_len=slice_len,
+            sampling=sampling,
+            priority_exponent=priority_exponent,
+            importance_exponent=importance_exponent,
+            traj_key=traj_key,
+        )
     return TensorDictReplayBuffer(
         storage=SequenceStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
-        sampler=_make_sampler(sampling, slice_len, traj_key),
+        sampler=sampler,
         batch_size=batch_size * slice_len,
     )
 

@@ -167,6 +167,33 @@ def episode_starts(init: Tensor, episode: Tensor, done: Tensor, newest: int, len
     return starts
 
 
+def steps_left(episode: Tensor, done: Tensor, newest: int) -> tuple[Tensor, Tensor]:
+    """How far each step of a ring is from the last stored step of its episode.
+
+    Args:
+        episode: number of the episode, ``[rows, N]``.
+        done: last step of an episode, ``[rows, N]`` bool.
+        newest: row that was written last.
+
+    Returns:
+        Stored steps from each step on, itself included, and whether they end with their episode, ``[rows, N]``.
+
+    Examples:
+        >>> episode, done = torch.tensor([[7], [7], [7], [5], [7]]), torch.tensor([[0], [0], [0], [1], [0]]).bool()
+        >>> left, ended = steps_left(episode, done, newest=2)
+        >>> left.flatten().tolist(), ended.flatten().tolist()
+        ([3, 2, 1, 1, 4], [False, False, False, True, False])
+    """
+    rows = len(episode)
+    age = rows - 1 - newest
+    episode, done = episode.roll(age, 0), done.roll(age, 0)  # oldest first
+    time = torch.arange(rows, device=episode.device).unsqueeze(-1)
+    is_last = episode != episode.roll(-1, 0)
+    is_last[-1] = True
+    last = torch.where(is_last, time, rows).flip(0).cummin(0).values.flip(0)
+    return (last - time + 1).roll(-age, 0), done.gather(0, last).roll(-age, 0)
+
+
 def padded_slices(
     start: Tensor, left: Tensor, length: int, *, rows: int
 ) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:

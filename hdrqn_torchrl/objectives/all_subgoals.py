@@ -39,7 +39,14 @@ from torchrl.objectives.utils import distance_loss
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
 from hdrqn_torchrl.modules.exploration import mask_values
-from hdrqn_torchrl.objectives.targets import double_q_value, lambda_returns, training_mask, watkins_trace
+from hdrqn_torchrl.objectives.targets import (
+    double_q_value,
+    importance_weight,
+    lambda_returns,
+    sequence_priority,
+    training_mask,
+    watkins_trace,
+)
 
 
 class AllSubgoalsLoss(LossModule):
@@ -49,7 +56,8 @@ class AllSubgoalsLoss(LossModule):
     on through ends of episodes; each should begin where an episode does, because the memory starts empty, unless it
     starts from what was stored (``stored_state``). Steps
     after a sequence's end are padding (``mask``): they contribute nothing, and what the last real step led to is
-    unknown unless it ended the episode.
+    unknown unless it ended the episode. ``priority`` tells what is left to learn from each sequence, of both levels
+    together, ``[B]``.
 
     Args:
         policy: network and keys.
@@ -91,6 +99,7 @@ class AllSubgoalsLoss(LossModule):
         active_subgoal: NestedKey = keys.ACTIVE_SUBGOAL
         option_init: NestedKey = keys.OPTION_INIT
         mask: NestedKey = keys.PAD_MASK
+        priority_weight: NestedKey = "priority_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -107,6 +116,7 @@ class AllSubgoalsLoss(LossModule):
         "target",
         "meta_q_value",
         "trained_steps",
+        "priority",
     ]
 
     def __init__(
@@ -176,16 +186,21 @@ class AllSubgoalsLoss(LossModule):
         sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
         meta_value = online[1][:, :-1]
         sub_steps, meta_steps = self._trained(tensordict, valid[:, :-1], events, agrees)
-        sub_loss, sub_error = self._distance(sub_value, sub_target, sub_steps)
-        meta_loss, meta_error = self._distance(meta_value, meta_target, meta_steps)
+        weight = tensordict.get(self.tensor_keys.priority_weight, None)
+        sub_loss = self._distance(sub_value, sub_target, sub_steps, weight)
+        meta_loss = self._distance(meta_value, meta_target, meta_steps, weight)
         with torch.no_grad():
             report = {
-                "td_error": sub_error,
-                "meta_td_error": meta_error,
+                "td_error": _masked_mean((sub_value - sub_target).abs(), sub_steps),
+                "meta_td_error": _masked_mean((meta_value - meta_target).abs(), meta_steps),
                 "q_value": _masked_mean(sub_value, sub_steps),
                 "target": _masked_mean(sub_target, sub_steps),
                 "meta_q_value": _masked_mean(meta_value, meta_steps),
                 "trained_steps": sub_steps.sum(),
+                "priority": sequence_priority(
+                    torch.cat([sub_value - sub_target, meta_value - meta_target], -1),
+                    torch.cat([sub_steps, meta_steps], -1),
+                ),
             }
         losses = {"loss": sub_loss + meta_loss, "sub_loss": sub_loss.detach(), "meta_loss": meta_loss.detach()}
         if self._predicts:
@@ -323,12 +338,13 @@ class AllSubgoalsLoss(LossModule):
             found.append(end | (found[-1] & visible))
         return torch.stack(found[:0:-1], 1)
 
-    def _distance(self, value: Tensor, target: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean loss and mean absolute error over ``mask``."""
+    def _distance(self, value: Tensor, target: Tensor, mask: Tensor, weight: Tensor | None) -> Tensor:
+        """Mean loss over ``mask``; sequences drawn by priority have a ``weight`` ``[B, T]``."""
         error = (value - target).masked_fill(~mask, 0.0)
-        count = mask.sum().clamp(min=1)
         distance = distance_loss(error, torch.zeros_like(error), self.loss_function)
-        return distance.sum() / count, error.detach().abs().sum() / count
+        if weight is not None:
+            distance = distance * importance_weight(weight)[:, None, None]
+        return distance.sum() / mask.sum().clamp(min=1)
 
 
 def _masked_mean(value: Tensor, mask: Tensor) -> Tensor:

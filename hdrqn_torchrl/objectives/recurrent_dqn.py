@@ -21,8 +21,10 @@ from hdrqn_torchrl.objectives.targets import (
     check_returns,
     double_q_value,
     greedy_choice,
+    importance_weight,
     lambda_returns,
     n_step_returns,
+    sequence_priority,
     smdp_target,
     training_mask,
     watkins_trace,
@@ -71,10 +73,11 @@ class RecurrentDQNLoss(LossModule):
     Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
     ``steps`` (under ``"next"``, ``None``: 1); ``init`` (restart of the state); ``mask`` (padding);
     ``action_mask`` (choices that exist, ``None``: all); ``eligible`` (steps that may enter the loss, ``None``: all;
-    unlike padding they are read, and may lie anywhere).
+    unlike padding they are read, and may lie anywhere); ``priority_weight`` (of sequences drawn by priority).
 
     Returns (``forward``): ``loss`` (scalar), and without gradient ``td_error`` (mean absolute), ``q_value`` and
-    ``target`` (means), ``trained_steps`` (how many steps entered the loss).
+    ``target`` (means), ``trained_steps`` (how many steps entered the loss), ``priority`` (of each
+    sequence, ``[B]``; see :func:`~hdrqn_torchrl.objectives.sequence_priority`).
 
     Examples:
         >>> from hdrqn_torchrl.modules import CellFeatures, QNetwork, SubController
@@ -98,6 +101,7 @@ class RecurrentDQNLoss(LossModule):
         steps: NestedKey | None = None
         init: NestedKey = keys.IS_INIT
         mask: NestedKey = keys.PAD_MASK
+        priority_weight: NestedKey = "priority_weight"
         action_mask: NestedKey | None = None
         eligible: NestedKey | None = None
 
@@ -108,7 +112,7 @@ class RecurrentDQNLoss(LossModule):
     target_value_network: TensorDictModuleBase
     target_value_network_params: TensorDictParams
     gamma: Tensor
-    out_keys = ["loss", "td_error", "q_value", "target", "trained_steps"]
+    out_keys = ["loss", "td_error", "q_value", "target", "trained_steps", "priority"]
 
     def __init__(
         self,
@@ -211,13 +215,17 @@ class RecurrentDQNLoss(LossModule):
             trained = usable & training_mask(valid, init, self.burn_in, self.train_exact_states)
             count = trained.sum().clamp(min=1)
             wanted = torch.where(trained, wanted, chosen)
-        loss = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0).sum() / count
+        distance = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0)
+        if (weight := tensordict.get(k.priority_weight, None)) is not None:
+            distance = distance * importance_weight(weight).unsqueeze(-1)
+        loss = distance.sum() / count
         with torch.no_grad():
             report = {
                 "td_error": (wanted - chosen).abs().masked_fill(~trained, 0.0).sum() / count,
                 "q_value": chosen.detach().masked_fill(~trained, 0.0).sum() / count,
                 "target": wanted.masked_fill(~trained, 0.0).sum() / count,
                 "trained_steps": trained.sum(),
+                "priority": sequence_priority(wanted - chosen, trained),
             }
         return TensorDict({"loss": loss, **report}, [])
 

@@ -155,6 +155,38 @@ def n_step_returns(
     return shorter
 
 
+def sequence_priority(error: Tensor, trained: Tensor, largest: float = 0.9) -> Tensor:
+    """Priority of replayed sequences: a mixture of their largest and their mean absolute TD error.
+
+    Args:
+        error: TD errors ``[B, T, *]``.
+        trained: bool, which of them count.
+        largest: share of the largest one; 0.9 is R2D2's (Kapturowski et al., 2019).
+
+    Returns:
+        ``[B]``; 0 where nothing counts.
+
+    Examples:
+        >>> sequence_priority(torch.tensor([[-1.0, 0.0, 9.0]]), torch.tensor([[True, True, False]]))
+        tensor([0.9500])
+    """
+    error, trained = error.abs().masked_fill(~trained, 0.0).flatten(1), trained.flatten(1)
+    mean = error.sum(1) / trained.sum(1).clamp(min=1)
+    return largest * error.amax(1) + (1 - largest) * mean
+
+
+def importance_weight(weight: Tensor) -> Tensor:
+    """Weights of sequences in a loss, relative to the largest of the minibatch (Schaul et al., 2016).
+
+    Args:
+        weight: the same at all steps of a sequence, ``[B, T]``.
+
+    Returns:
+        ``[B]``.
+    """
+    return weight[:, 0] / weight[:, 0].max()
+
+
 def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_states: bool) -> Tensor:
     """Which steps of sequences enter the loss (the paper: the last half).
 

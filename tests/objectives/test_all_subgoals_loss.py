@@ -296,6 +296,22 @@ class TestAgainstPlainLoops:
         torch.testing.assert_close(action_value.grad, expected_sub, rtol=1e-4, atol=1e-7)
         torch.testing.assert_close(subgoal_value.grad, expected_meta, rtol=1e-4, atol=1e-7)
 
+    @pytest.mark.parametrize("settings", [{}, {"loss_function": "smooth_l1"}, {"all_subgoals": False}], ids=str)
+    def test_weighted_losses_and_priorities_of_both_levels(self, settings):
+        loss = make_loss(**settings)
+        td = pad(play(loss))
+        td["priority_weight"] = (1.0 + torch.arange(B))[:, None].expand(B, T)
+        result, weight = loss(td), [(1 + b) / B for b in range(B)]
+        function = settings.get("loss_function", "l2")
+        levels = Reference(in_sequences(loss), td, **settings).run()
+        for key, errors in zip(("sub_loss", "meta_loss"), levels, strict=True):
+            wanted = sum(weight[place[0]] * mean_loss({0: error}, function) for place, error in errors.items())
+            assert result[key].item() == pytest.approx(wanted / len(errors), rel=1e-5)
+        assert result["loss"].item() == pytest.approx(result["sub_loss"].item() + result["meta_loss"].item(), rel=1e-5)
+        found = [[abs(e) for errors in levels for place, e in errors.items() if place[0] == b] for b in range(B)]
+        wanted = [0.9 * max(errors) + 0.1 * sum(errors) / len(errors) if errors else 0.0 for errors in found]
+        assert result["priority"].tolist() == pytest.approx(wanted, rel=1e-4)
+
     def test_the_report(self):
         loss = make_loss()
         td = play(loss)
@@ -417,7 +433,11 @@ def test_targets_of_padded_sequences_by_hand(real, events, sub, meta):
     td = td[:, torch.arange(4).clamp(max=real - 1)].contiguous()
     td["collector", "mask"] = (torch.arange(4) < real)[None]
     td["observation"] = torch.arange(4)[None]  # entries of their own, so that padding shows if it is trained
-    loss(td)["loss"].backward()
+    result = loss(td)
+    result["loss"].backward()
+    errors = [abs(1 - y) for y in sub if y is not None] + [abs(y) for y in meta if y is not None]
+    priority = 0.9 * max(errors) + 0.1 * sum(errors) / len(errors) if errors else 0.0
+    assert result["priority"].item() == pytest.approx(priority)
     action_value, subgoal_value, *_ = tables(loss)
     nothing = [None] * (3 - real)
     check_gradient(action_value.grad.sum((1, 2)), [1.0] * 4, sub + nothing)
@@ -592,7 +612,7 @@ class TestInTheEnvironment:
             td["next", f"agent_{key}", "x"] = td["next"].pop(key)
         moved = {key: (f"agent_{key}", "x") for key in loss.default_keys.__dataclass_fields__}
         loss.set_keys(**moved)
-        assert len(moved) == 9 and loss(td)["loss"] == expected
+        assert len(moved) == 10 and loss(td)["loss"] == expected
 
 
 def test_everything_stays_on_the_device():
@@ -610,7 +630,7 @@ def test_sequences_without_anything_to_train():
     td["next", "done"][:], td["next", "terminated"][:], td["next", "attained"][:] = True, False, False
     result = loss(td)
     assert result["loss"] == 0 and result["trained_steps"] == 0
-    assert all(torch.isfinite(value) for value in result.values())
+    assert all(torch.isfinite(value).all() for value in result.values())
 
 
 @pytest.mark.parametrize("name", ["sub_gamma", "meta_gamma", "trace_decay"])

@@ -115,9 +115,14 @@ def reference(
     huber=False,
     limit=None,
     state=None,
+    weight=None,
+    errors=None,
     **targets,
 ):
-    """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps."""
+    """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps.
+
+    Sequences may have a weight; ``errors`` is filled with the absolute TD errors of each.
+    """
     keys = {"action": "action", "reward": "reward", "done": "done", "terminated": "terminated", "init": "is_init"}
     keys |= {"flat": {}, "sub": SUB_KEYS, "meta": META_KEYS}[level]
     target_network, gamma = target_of(loss, network), loss.gamma.item()
@@ -153,7 +158,10 @@ def reference(
             y = target(row, t, **targets)
             y = y if limit is None else min(y, torch.tensor(limit))
             prediction = q[t, row.action[t]]
-            total = total + (functional.smooth_l1_loss(prediction, y) if huber else (prediction - y) ** 2)
+            distance = functional.smooth_l1_loss(prediction, y) if huber else (prediction - y) ** 2
+            total = total + distance * (1.0 if weight is None else weight[b])
+            if errors is not None:
+                errors[b].append(abs(prediction - y).item())
             count += 1
     return total / count, count
 
@@ -245,6 +253,7 @@ class TestAgainstPlainLoops:
         assert result["q_value"].item() == pytest.approx(chosen[trained].mean().item())
         assert result["loss"].item() >= result["td_error"].item() ** 2
         assert (result["target"] - result["q_value"]).abs().item() <= result["td_error"].item() + 1e-12
+        assert set(result.keys()) == set(loss.out_keys)
         assert not any(result[key].requires_grad for key in loss.out_keys if key != "loss")
 
 
@@ -314,6 +323,42 @@ class TestStoredStates:
     def test_a_network_without_them_is_refused(self):
         with pytest.raises(ValueError, match=r"state_keys must be recurrent states .* got \['sub_hidden'\]"):
             make_loss(recurrent=False, state_keys=["sub_hidden"])
+
+
+class TestPriorities:
+    @pytest.mark.parametrize("padded", [True, False])
+    @pytest.mark.parametrize("settings", [{}, {"loss_function": "smooth_l1"}, {"burn_in": 0.8}], ids=str)
+    @pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+    def test_weighted_loss_and_priorities_against_plain_loops(self, level, settings, padded):
+        loss, network = make_loss(level, **settings)
+        sample = make_sample(padded=padded)
+        sample["priority_weight"] = torch.tensor([3.0, 1.0, 0.5, 2.0, 6.0, 0.0])[:, None].expand(BATCH, TIME).double()
+        errors = [[] for _ in range(BATCH)]
+        others = {"burn_in": settings.get("burn_in", 0.5), "huber": "loss_function" in settings}
+        weight = [0.5, 1 / 6, 1 / 12, 1 / 3, 1.0, 0.0]  # relative to the largest
+        wanted, count = reference(loss, network, sample, level=level, weight=weight, errors=errors, **others)
+        result = loss(sample.clone())
+        torch.testing.assert_close(result["loss"], wanted)
+        assert result["trained_steps"] == count and result["loss"].requires_grad
+        priorities = [0.9 * max(found) + 0.1 * sum(found) / len(found) if found else 0.0 for found in errors]
+        assert result["priority"].tolist() == pytest.approx(priorities) and not result["priority"].requires_grad
+
+    def test_what_is_reported_has_no_weights(self):
+        loss, _ = make_loss()
+        sample = make_sample()
+        plain = loss(sample)
+        sample["priority_weight"] = torch.rand(BATCH, 1).expand(BATCH, TIME)
+        weighted = loss(sample)
+        assert weighted["loss"] != plain["loss"]
+        for key in ("td_error", "q_value", "target", "trained_steps"):
+            assert weighted[key] == plain[key]
+
+    def test_equal_weights_change_nothing(self):
+        loss, _ = make_loss()
+        sample = make_sample()
+        plain = loss(sample)["loss"]
+        sample["priority_weight"] = torch.full((BATCH, TIME), 0.1)
+        assert loss(sample)["loss"] == plain
 
 
 class TestLeaks:

@@ -3,8 +3,10 @@ import torch
 
 from hdrqn_torchrl.objectives import (
     double_q_value,
+    importance_weight,
     lambda_returns,
     n_step_returns,
+    sequence_priority,
     smdp_target,
     training_mask,
     watkins_trace,
@@ -239,3 +241,26 @@ class TestAgainstPlainLoops:
         lambda_returns(*given)
         n_step_returns(self.reward, self.ended, self.next_value, self.greedy, self.discount, 3)
         assert all((tensor == copy).all() for tensor, copy in zip(given, copies, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("errors", "trained", "priority"),
+    [
+        ([1.0, -3.0, 2.0], "111", 0.9 * 3 + 0.1 * 2),
+        ([1.0, -3.0, 2.0], "101", 0.9 * 2 + 0.1 * 1.5),
+        ([1.0, -3.0, NAN], "110", 0.9 * 3 + 0.1 * 2),
+        ([1.0, -3.0, 2.0], "000", 0.0),
+        ([-0.5, 7.0, 7.0], "100", 0.5),
+    ],
+)
+def test_sequence_priority(errors, trained, priority):
+    error, trained = torch.tensor([errors, [0.0] * 3]), torch.cat([flags(trained), flags("111")])
+    assert sequence_priority(error, trained).tolist() == pytest.approx([priority, 0.0])
+    several = torch.stack([error, error], -1), torch.stack([trained, torch.zeros_like(trained)], -1)
+    assert sequence_priority(*several).tolist() == pytest.approx([priority, 0.0])  # the second column does not count
+    assert sequence_priority(torch.tensor([[1.0, 3.0]]), flags("11"), largest=0.5).item() == pytest.approx(2.5)
+
+
+def test_importance_weight():
+    weight = torch.tensor([[0.5, 0.5], [2.0, 2.0], [1.0, 1.0]])
+    assert importance_weight(weight).tolist() == [0.25, 1.0, 0.5]
