@@ -13,11 +13,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.finite import FiniteGuard
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
-
-
-class NonFiniteError(ArithmeticError):
-    """A number that training depends on became NaN or infinite."""
+from hdrqn_torchrl.precision import Precision, choose_precision, matrix_products
 
 
 class Extract(Protocol):
@@ -54,6 +52,7 @@ class LearnerSettings:
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be, if known; targets are cut off above it.
+        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (see :func:`~hdrqn_torchrl.precision.choose_precision`).
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -75,6 +74,7 @@ class LearnerSettings:
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
     max_target: float | None = None
+    precision: Precision | Literal["auto"] = "fp32"
 
     def __post_init__(self) -> None:
         rules = (
@@ -137,8 +137,11 @@ class Learner:
         self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
         self.loss = _recurrent_loss(network, settings, gamma, loss_keys or {}) if loss is None else loss
         self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
-        self._parameters = list(network.parameters())
-        self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, fused=True)
+        self._parameters = dict(network.named_parameters())
+        self.device = next(iter(self._parameters.values())).device
+        self.precision = choose_precision(settings.precision, network)
+        self.guard = FiniteGuard(at_once=self.device.type == "cpu")
+        self.optimizer = torch.optim.Adam(self._parameters.values(), lr=settings.learning_rate, fused=True)
         self._sequence_len = settings.slice_len + lookahead
         self.buffer = make_sequence_buffer(
             settings.capacity,
@@ -146,7 +149,7 @@ class Learner:
             batch_size=settings.batch_size * samples_per_draw,
             num_envs=num_envs,
             sampling=settings.sampling,
-            device=self._parameters[0].device,
+            device=self.device,
         )
         self._drawn: list[TensorDictBase] = []
         self.updates, self.frames = 0, 0
@@ -161,6 +164,7 @@ class Learner:
 
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
+        self.check_finite()
         self.frames += batch.numel()
         self._drawn = []
         for group in self.optimizer.param_groups:
@@ -192,35 +196,44 @@ class Learner:
             gradients are clipped, ``grad_norm``.
 
         Raises:
-            NonFiniteError: if loss or gradient is; the weights are as they were.
+            NonFiniteError: if loss or gradient is; the weights are as they were. On a GPU they are left alone, too, and
+                :meth:`check_finite` raises it.
         """
-        metrics = dict(self.loss(sample).items())
+        with matrix_products(self.precision, self.device.type):
+            metrics = dict(self.loss(sample).items())
         self.optimizer.zero_grad()
         metrics["loss"].backward()
-        gradients = [parameter.grad for parameter in self._parameters if parameter.grad is not None]
-        norm = torch.nn.utils.get_total_norm(gradients)
-        if not torch.isfinite(metrics["loss"] + norm):
-            raise NonFiniteError(self._explain_non_finite(metrics["loss"]))
+        norm = self._watch_gradients(metrics["loss"])
         if self.settings.max_grad_norm is not None:
-            torch.nn.utils.clip_grads_with_norm_(self._parameters, self.settings.max_grad_norm, norm)
+            torch.nn.utils.clip_grads_with_norm_(self._parameters.values(), self.settings.max_grad_norm, norm)
             metrics["grad_norm"] = norm
         self.optimizer.step()
         self.target_updater.step()
         self.updates += 1
         return {name: value.detach() for name, value in metrics.items()}
 
-    def _explain_non_finite(self, loss: Tensor) -> str:
-        """Names what is not finite, looked up only once something is."""
-        where = f"in update {self.updates + 1}, frame {self.frames}"
-        if not torch.isfinite(loss):
-            return f"the loss became {loss.item()} {where}"
-        for name, parameter in self.network.named_parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                return f"the gradient of {name} became NaN or infinite {where}"
-        return f"the gradient's norm became infinite {where}"
+    def _watch_gradients(self, loss: Tensor) -> Tensor:
+        """Norm of all gradients; an update in which something is not finite goes no further."""
+        gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
+        norm = torch.nn.utils.get_total_norm(gradients.values())
+        skip = self.guard.watch(loss, gradients, norm, f"update {self.updates + 1}, frame {self.frames}")
+        if skip is not None:
+            self.optimizer.found_inf = skip  # type: ignore[attr-defined]  # read by torch's fused Adam
+        return norm
+
+    def check_finite(self) -> None:
+        """Looks at all updates since the last call, on devices where :meth:`update` does not look at each.
+
+        :meth:`store` and :meth:`state_dict` call it, too.
+
+        Raises:
+            NonFiniteError: as :meth:`update`.
+        """
+        self.guard.check()
 
     def state_dict(self) -> dict[str, Any]:
         """All that learning depends on: both networks, optimiser, replay memory, counters."""
+        self.check_finite()
         return {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -230,6 +243,7 @@ class Learner:
             "updates": self.updates,
             "frames": self.frames,
             "warm_at": self._warm_at,
+            "precision": self.precision,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -240,6 +254,8 @@ class Learner:
         self.extract.load_state_dict(state["extract"])
         self._drawn = list(state["drawn"])
         self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
+        if self.settings.precision == "auto":  # another machine might choose another one
+            self.precision = choose_precision(state.get("precision", "fp32"), self.network)
 
 
 def _recurrent_loss(

@@ -1,0 +1,66 @@
+"""The precision of learning: float32, or bfloat16 in the matrix products of losses.
+
+Lower is only what autocast lowers, dense layers, convolutions and the LSTM. Parameters, Q-values, targets, optimiser,
+acting and all that is stored are float32 in any case.
+"""
+
+from __future__ import annotations
+
+import warnings
+from contextlib import AbstractContextManager, nullcontext
+from typing import Literal
+
+import torch
+from torch import nn
+
+Precision = Literal["fp32", "bf16"]
+
+
+def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) -> Precision:
+    """What a setting means for a network on its device.
+
+    Args:
+        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it in hardware (a GPU that has it, a CPU with AMX)
+            and the network is large enough to gain, else ``"fp32"``. The same machine and network give the same answer.
+        network: its parameters are where it will be trained.
+
+    Raises:
+        ValueError: if ``wanted`` is unknown, or ``"bf16"`` on a GPU that lacks it.
+
+    Examples:
+        >>> choose_precision("auto", nn.Linear(4, 2))
+        'fp32'
+    """
+    if wanted not in ("auto", "fp32", "bf16"):
+        raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {wanted!r}; 'fp32' is always right.")
+    kind = next(network.parameters()).device.type
+    if wanted == "auto":
+        return "bf16" if gains(network) and multiplies_bfloat16(kind) else "fp32"
+    if wanted == "bf16" and not multiplies_bfloat16(kind):
+        if kind != "cpu":
+            raise ValueError(f"precision must be 'fp32' or 'auto' on this device ({kind}), which lacks bf16.")
+        warnings.warn("precision='bf16' is slow on a CPU without AMX; use 'auto' or 'fp32'.", stacklevel=2)
+    return wanted
+
+
+def multiplies_bfloat16(kind: str) -> bool:
+    """Whether devices of a kind (``"cpu"``, ``"cuda"``) have matrix units for bfloat16."""
+    if kind == "cpu":
+        return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
+    return kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+
+
+def gains(network: nn.Module) -> bool:
+    """Whether a network is large enough: it has convolutions, or an LSTM of at least 128 units."""
+    return any(
+        isinstance(part, nn.Conv2d) or (isinstance(part, nn.LSTM) and part.hidden_size >= 128)
+        for part in network.modules()
+    )
+
+
+def matrix_products(precision: Precision, kind: str) -> AbstractContextManager:
+    """A context for the forward pass of a loss on a kind of device; its backward pass follows suit."""
+    if precision == "fp32":
+        return nullcontext()
+    # Without cache: a weight first read without gradient, by a target network, would lose its gradient for good.
+    return torch.autocast(kind, torch.bfloat16, cache_enabled=False)
