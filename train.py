@@ -60,7 +60,7 @@ def train(run: Plan) -> float:
     import torch
     from torchrl.checkpoint import CheckpointError
 
-    from hdrqn_torchrl.learner import NonFiniteError
+    from hdrqn_torchrl.finite import NonFiniteError
     from hdrqn_torchrl.run_folder import locked
 
     torch.set_num_threads(run.config.threads)

@@ -13,11 +13,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.finite import FiniteGuard
 from hdrqn_torchrl.objectives import check_returns
-
-
-class NonFiniteError(ArithmeticError):
-    """A number that training depends on became NaN or infinite."""
+from hdrqn_torchrl.precision import Precision, choose_precision, matrix_products
 
 
 class Extract(Protocol):
@@ -66,6 +64,7 @@ class LearnerSettings:
         max_target: largest return there can be, if known; targets are cut off above it.
         trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
         n_step: rewards of a target; 1: one-step targets.
+        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (see :func:`~hdrqn_torchrl.precision.choose_precision`).
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -92,6 +91,7 @@ class LearnerSettings:
     max_target: float | None = None
     trace_decay: float = 0.0
     n_step: int = 1
+    precision: Precision | Literal["auto"] = "fp32"
 
     def __post_init__(self) -> None:
         check_returns(self.trace_decay, self.n_step)
@@ -186,8 +186,11 @@ class Learner:
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
         self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
-        self._parameters = list(network.parameters())
-        self.optimizer = torch.optim.Adam(self._parameters, lr=settings.learning_rate, fused=True)
+        self._parameters = dict(network.named_parameters())
+        self.device = next(iter(self._parameters.values())).device
+        self.precision = choose_precision(settings.precision, network)
+        self.guard = FiniteGuard(at_once=self.device.type == "cpu")
+        self.optimizer = torch.optim.Adam(self._parameters.values(), lr=settings.learning_rate, fused=True)
         self._sequence_len = settings.slice_len + lookahead
         self.buffer = make_sequence_buffer(
             settings.capacity,
@@ -197,7 +200,7 @@ class Learner:
             sampling=settings.sampling,
             priority_exponent=settings.priority_exponent,
             importance_exponent=settings.importance_exponent,
-            device=self._parameters[0].device,
+            device=self.device,
         )
         self._drawn: list[TensorDictBase] = []
         self.updates, self.frames = 0, 0
@@ -212,6 +215,7 @@ class Learner:
 
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
+        self.check_finite()
         self.frames += batch.numel()
         self._drawn = []
         for group in self.optimizer.param_groups:
@@ -243,18 +247,17 @@ class Learner:
             gradients are clipped, ``grad_norm``.
 
         Raises:
-            NonFiniteError: if loss or gradient is; the weights are as they were.
+            NonFiniteError: if loss or gradient is; the weights are as they were. On a GPU they are left alone, too, and
+                :meth:`check_finite` raises it.
         """
-        metrics = dict(self.loss(sample).items())
+        with matrix_products(self.precision, self.device.type):
+            metrics = dict(self.loss(sample).items())
         priority = metrics.pop("priority", None)
         self.optimizer.zero_grad()
         metrics["loss"].backward()
-        gradients = [parameter.grad for parameter in self._parameters if parameter.grad is not None]
-        norm = torch.nn.utils.get_total_norm(gradients)
-        if not torch.isfinite(metrics["loss"] + norm):
-            raise NonFiniteError(self._explain_non_finite(metrics["loss"]))
+        norm = self._watch_gradients(metrics["loss"])
         if self.settings.max_grad_norm is not None:
-            torch.nn.utils.clip_grads_with_norm_(self._parameters, self.settings.max_grad_norm, norm)
+            torch.nn.utils.clip_grads_with_norm_(self._parameters.values(), self.settings.max_grad_norm, norm)
             metrics["grad_norm"] = norm
         self.optimizer.step()
         self.target_updater.step()
@@ -263,18 +266,28 @@ class Learner:
             self.buffer.update_priority(sample["index"][:, 0], priority)
         return {name: value.detach() for name, value in metrics.items()}
 
-    def _explain_non_finite(self, loss: Tensor) -> str:
-        """Names what is not finite, looked up only once something is."""
-        where = f"in update {self.updates + 1}, frame {self.frames}"
-        if not torch.isfinite(loss):
-            return f"the loss became {loss.item()} {where}"
-        for name, parameter in self.network.named_parameters():
-            if parameter.grad is not None and not torch.isfinite(parameter.grad).all():
-                return f"the gradient of {name} became NaN or infinite {where}"
-        return f"the gradient's norm became infinite {where}"
+    def _watch_gradients(self, loss: Tensor) -> Tensor:
+        """Norm of all gradients; an update in which something is not finite goes no further."""
+        gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
+        norm = torch.nn.utils.get_total_norm(gradients.values())
+        skip = self.guard.watch(loss, gradients, norm, f"update {self.updates + 1}, frame {self.frames}")
+        if skip is not None:
+            self.optimizer.found_inf = skip  # type: ignore[attr-defined]  # read by torch's fused Adam
+        return norm
+
+    def check_finite(self) -> None:
+        """Looks at all updates since the last call, on devices where :meth:`update` does not look at each.
+
+        :meth:`store` and :meth:`state_dict` call it, too.
+
+        Raises:
+            NonFiniteError: as :meth:`update`.
+        """
+        self.guard.check()
 
     def state_dict(self) -> dict[str, Any]:
         """All that learning depends on: both networks, optimiser, replay memory, counters."""
+        self.check_finite()
         return {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
@@ -284,6 +297,7 @@ class Learner:
             "updates": self.updates,
             "frames": self.frames,
             "warm_at": self._warm_at,
+            "precision": self.precision,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -294,3 +308,5 @@ class Learner:
         self.extract.load_state_dict(state["extract"])
         self._drawn = list(state["drawn"])
         self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
+        if self.settings.precision == "auto":  # another machine might choose another one
+            self.precision = choose_precision(state.get("precision", "fp32"), self.network)

@@ -8,7 +8,8 @@ learners draws from its own.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.checkpoint import Checkpoints
 from hdrqn_torchrl.evaluation import EpisodeTracker
+from hdrqn_torchrl.finite import NonFiniteError
 from hdrqn_torchrl.interruption import Interrupted, StopRequest
-from hdrqn_torchrl.learner import NonFiniteError
 from hdrqn_torchrl.logging import Row, RunLogger
 
 
@@ -134,9 +135,11 @@ class Trainer:
     def _complete_iteration(self) -> None:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
         for name, learner in self.algorithm.learners.items():
-            for _ in range(learner.updates_due()):
-                self._stop.check()
-                self._update(name)
+            with _naming(name):
+                for _ in range(learner.updates_due()):
+                    self._stop.check()
+                    self._window.add_update(name, learner.update(learner.sample()))
+                learner.check_finite()
         self.collector.update_policy_weights_()
         before, best = self._completed, False
         if before != self.frames:
@@ -148,14 +151,6 @@ class Trainer:
         if before is not None and (best or late or crossed(before, self.frames, self.checkpoint_frames)):
             self.save(score=self.best_return if best else None)
         self._stop.check()
-
-    def _update(self, name: str) -> None:
-        learner = self.algorithm.learners[name]
-        try:
-            metrics = learner.update(learner.sample())
-        except NonFiniteError as error:
-            raise NonFiniteError(f"{name}: {error}") from error
-        self._window.add_update(name, metrics)
 
     def _due(self, interval: int) -> bool:
         """Whether a multiple of ``interval`` was passed in this iteration; at the very beginning, too."""
@@ -250,6 +245,15 @@ class Trainer:
 def crossed(before: int, after: int, interval: int) -> bool:
     """Whether a multiple of ``interval`` lies in (before, after]."""
     return before // interval < after // interval
+
+
+@contextmanager
+def _naming(learner: str) -> Iterator[None]:
+    """Puts the learner's name before its complaint."""
+    try:
+        yield
+    except NonFiniteError as error:
+        raise NonFiniteError(f"{learner}: {error}") from error
 
 
 def check_finite(batch: TensorDictBase, frames: int) -> None:

@@ -6,7 +6,8 @@ from helpers import build, collect, parameter_distance, small_env, tiny_settings
 from tensordict import TensorDict
 
 from hdrqn_torchrl.algorithms import make_recurrent_loss
-from hdrqn_torchrl.learner import Learner, LearnerSettings, NonFiniteError
+from hdrqn_torchrl.finite import NonFiniteError
+from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
 
 

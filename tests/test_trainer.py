@@ -9,8 +9,8 @@ from torch import nn
 from hdrqn_torchrl import trainer as trainer_module
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.checkpoint import Checkpoints, load_policy
+from hdrqn_torchrl.finite import NonFiniteError
 from hdrqn_torchrl.interruption import Interrupted
-from hdrqn_torchrl.learner import NonFiniteError
 from hdrqn_torchrl.trainer import Trainer, check_finite, crossed
 
 
@@ -158,6 +158,9 @@ class CountingLearner(Stateless):
         self.updates, self.owed = self.updates + 1, self.owed - 1
         self.told.append("update")
         return {"loss": torch.tensor(float(self.updates))}
+
+    def check_finite(self):
+        """Everything is."""
 
 
 def test_every_learner_gets_each_batch_and_its_own_updates():

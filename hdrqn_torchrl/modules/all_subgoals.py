@@ -16,12 +16,13 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.modules.controllers import first_state
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
 from hdrqn_torchrl.modules.features import Features
-from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
+from hdrqn_torchrl.modules.lstm import Gaps, lstm_weights, restarting_lstm
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
-from hdrqn_torchrl.modules.q_network import State, dueling
+from hdrqn_torchrl.modules.q_network import ExactLinear, State, dueling
 
 
 class AllSubgoalsNetwork(nn.Module):
@@ -68,22 +69,18 @@ class AllSubgoalsNetwork(nn.Module):
         self.num_actions, self.num_subgoals = num_actions, num_subgoals
         self.register_buffer("_one_hot", torch.eye(num_actions), persistent=False)
         self.memory = nn.LSTM(features.out_features + num_actions, hidden_size, batch_first=True)
-        self.sub_head = nn.Sequential(
-            nn.Linear(hidden_size, head_size), nn.ReLU(), nn.Linear(head_size, num_subgoals * (1 + num_actions))
-        )
+        self.sub_head = _head(hidden_size, head_size, num_subgoals * (1 + num_actions))
         # Which subgoals are left decides which one pays; the memory need not count them.
-        self.meta_head = nn.Sequential(
-            nn.Linear(hidden_size + num_subgoals, head_size), nn.ReLU(), nn.Linear(head_size, 1 + num_subgoals)
-        )
+        self.meta_head = _head(hidden_size + num_subgoals, head_size, 1 + num_subgoals)
 
     def initial_state(self, *batch: int) -> State:
         """Zero LSTM state, two tensors ``[*batch, H]``."""
         zeros = self._one_hot.new_zeros((*batch, self.hidden_size))
         return zeros, zeros.clone()
 
-    def _inputs(self, observation: Tensor, previous_action: Tensor, init: Tensor) -> Tensor:
+    def _inputs(self, observation: Tensor, previous_action: Tensor, init: Tensor) -> list[Tensor]:
         action = self._one_hot[previous_action] * ~init.unsqueeze(-1)  # none at the first step of an episode
-        return torch.cat([self.features(observation), action], -1)
+        return [self.features(observation), action]
 
     def _values(self, hidden: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         action_value = dueling(self.sub_head(hidden).unflatten(-1, (self.num_subgoals, -1)))
@@ -105,7 +102,7 @@ class AllSubgoalsNetwork(nn.Module):
         Returns:
             Q-values ``[*, G, A]`` and ``[*, G]``, and the state after ``observation``.
         """
-        inputs = self._inputs(observation, previous_action, init)
+        inputs = torch.cat(self._inputs(observation, previous_action, init), -1)
         state = tuple(part.masked_fill(init.unsqueeze(-1), 0.0) for part in state)  # type: ignore[assignment]
         if inputs.ndim == 1:
             advanced = torch.lstm_cell(inputs[None], [part[None] for part in state], *lstm_weights(self.memory))
@@ -131,10 +128,20 @@ class AllSubgoalsNetwork(nn.Module):
         Returns:
             Q-values ``[B, T, G, A]`` and ``[B, T, G]``, and the memory's output ``[B, T, H]`` they were read from.
         """
-        inputs = self._inputs(observation, previous_action, init)
-        state = self.initial_state(len(inputs)) if state is None else state
-        memory = restarting_lstm(self.memory, inputs, init, state)
-        return *self._values(memory, mask), memory
+        state = self.initial_state(len(init)) if state is None else state
+        if not on_host(init):
+            inputs = torch.cat(self._inputs(observation, previous_action, init), -1)
+            memory = restarting_lstm(self.memory, inputs, init, state)
+            return *self._values(memory, mask), memory
+        gaps = Gaps(init)
+        parts = self._inputs(*(gaps.insert(steps) for steps in (observation, previous_action, init)))
+        memory = gaps.lstm(self.memory, parts, state)
+        action_value, subgoal_value = self._values(memory, gaps.insert(mask))
+        return gaps.remove(action_value), gaps.remove(subgoal_value), gaps.remove(memory)
+
+
+def _head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(inplace=True), ExactLinear(hidden, outputs))
 
 
 class AllSubgoalsPolicy(TensorDictModuleBase):

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import embedding
 
+from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
 
 
@@ -78,12 +80,12 @@ class ConvFeatures(Features):
         layers: list[nn.Module] = []
         previous, side = in_channels, size
         for width, (kernel, stride) in zip(channels, kernels_and_strides, strict=True):
-            layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU()]
+            layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU(inplace=True)]
             previous, side = width, (side - kernel) // stride + 1
         if side < 1:
             raise ValueError(f"size must be >= 33 pixels for four convolutions, got {size}; the paper uses 44.")
         self.convolutions = nn.Sequential(*layers)
-        self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU())
+        self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU(inplace=True))
         self.out_features = out_features
 
     def forward(self, image: Tensor) -> Tensor:
@@ -118,7 +120,8 @@ class CellFeatures(Features):
         self.out_features = widths[-1]
 
     def forward(self, cells: Tensor) -> Tensor:
-        return self.dense(self._one_hot[cells.flatten(-2).long()].flatten(-2))
+        one_hot = self._one_hot.to(autocast_dtype(self._one_hot))
+        return _on_rows(self.dense, embedding(cells.flatten(-2).int(), one_hot).flatten(-2))
 
 
 class FullyConnectedFeatures(Features):
@@ -138,7 +141,7 @@ class FullyConnectedFeatures(Features):
         self.out_features = widths[-1]
 
     def forward(self, vector: Tensor) -> Tensor:
-        return self.dense(vector)
+        return _on_rows(self.dense, vector)
 
 
 class ChainedFeatures(Features):
@@ -155,6 +158,12 @@ class ChainedFeatures(Features):
 def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for width in widths:
-        layers += [nn.Linear(in_features, width), nn.ReLU()]
+        layers += [nn.Linear(in_features, width), nn.ReLU(inplace=True)]
         in_features = width
     return nn.Sequential(*layers)
+
+
+def _on_rows(layers: nn.Sequential, vectors: Tensor) -> Tensor:
+    """Applies layers to ``[*, I]`` as rows: autograd copies much where ReLU writes into a view."""
+    rows = layers(vectors.reshape(-1, vectors.shape[-1]))
+    return rows.view(*vectors.shape[:-1], rows.shape[-1])

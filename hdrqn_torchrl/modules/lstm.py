@@ -1,9 +1,14 @@
 """An LSTM over sequences whose state restarts inside them.
 
-``nn.LSTM`` cannot restart its state in mid-sequence; a loop over ``LSTMCell`` can, but pays for autograd at
-every step and multiplies out each weight gradient T times. Here one matrix product serves the inputs of all
-steps, and one each weight gradient; only what is truly sequential is done step by step. The gate order and
-the parameters are those of ``nn.LSTM``.
+``nn.LSTM`` cannot restart its state in mid-sequence, and a loop over ``LSTMCell``, which can, pays for autograd at
+every step and multiplies out each weight gradient T times. Here are two ways with the gate order and the parameters
+of ``nn.LSTM``:
+
+- :func:`restarting_lstm` is a loop with a backward pass of its own. One matrix product serves the inputs of all steps,
+  and one each weight gradient; only what is truly sequential is done step by step.
+- :class:`Gaps` puts an empty step before each restart, at which the state becomes zero; then the library's own
+  kernels run through whole sequences. On a CPU that is faster for long sequences, and for all under autocast. How many
+  steps it takes depends on the data, so the host has to read it: a GPU would have to wait for that.
 """
 
 from __future__ import annotations
@@ -12,12 +17,23 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from hdrqn_torchrl.devices import autocast_dtype, on_host
+
+CLOSED = -1e4
+"""Input of a gate at a gap; its sigmoid is zero in every floating-point format."""
+
 
 class _RestartingLSTM(torch.autograd.Function):
+    """The loop. ``inputs`` and both weights may have a lower precision: they are multiplied in it, nothing else is."""
+
     @staticmethod
     def forward(ctx, inputs, keep, hidden, cell, weight_ih, weight_hh, bias):  # noqa: ANN001, ANN205
-        time, size = len(inputs), hidden.shape[-1]
-        gates = torch.addmm(bias, inputs.flatten(0, 1), weight_ih.t()).unflatten(0, (time, -1))  # [T, B, 4H]
+        time, size, low = len(inputs), hidden.shape[-1], weight_hh.dtype
+        mixed = low != hidden.dtype
+        if mixed:
+            gates = (inputs.flatten(0, 1) @ weight_ih.t() + bias).unflatten(0, (time, -1))
+        else:
+            gates = torch.addmm(bias, inputs.flatten(0, 1), weight_ih.t()).unflatten(0, (time, -1))  # [T, B, 4H]
         write_and_forget = gates[..., : 2 * size]
         write, forget, update, read = gates.chunk(4, -1)  # views, filled step by step
         hiddens, cells, squashed, outputs = gates.new_empty((4, time, *hidden.shape)).unbind()
@@ -25,7 +41,10 @@ class _RestartingLSTM(torch.autograd.Function):
         for step in range(time):
             torch.mul(hidden, keep[step], out=hiddens[step])
             torch.mul(cell, keep[step], out=cells[step])
-            gates[step].addmm_(hiddens[step], weight_hh_t)
+            if mixed:
+                gates[step] += hiddens[step].to(low) @ weight_hh_t
+            else:
+                gates[step].addmm_(hiddens[step], weight_hh_t)
             write_and_forget[step].sigmoid_()
             update[step].tanh_()
             read[step].sigmoid_()
@@ -40,6 +59,7 @@ class _RestartingLSTM(torch.autograd.Function):
     @once_differentiable
     def backward(ctx, grad):  # noqa: ANN001, ANN205
         inputs, keep, weight_ih, weight_hh, gates, hiddens, cells, squashed = ctx.saved_tensors
+        low = weight_hh.dtype
         write, forget, update, read = gates.chunk(4, -1)
         # How the cell (first three gates) and the output (last gate) answer to each gate's input, for all steps at
         # once; multiplied in place by their gradients below, this becomes the gradient of the gates.
@@ -59,13 +79,14 @@ class _RestartingLSTM(torch.autograd.Function):
             grad_cell = torch.addcmul(grad_cell, grad_hidden, output_by_cell[step])
             by_cell[step] *= grad_cell.unsqueeze(1)
             of_read[step] *= grad_hidden
-            grad_hidden = (grad_gates[step] @ weight_hh).mul_(keep[step])
+            grad_hidden = (grad_gates[step].to(low) @ weight_hh).to(grad.dtype).mul_(keep[step])
             grad_cell = grad_cell * cell_by_cell[step]
         flat = grad_gates.flatten(0, 1)
+        grad_bias, flat = flat.sum(0), flat.to(low)
         grad_inputs = (flat @ weight_ih).view_as(inputs) if ctx.needs_input_grad[0] else None
         grad_weight_ih = flat.t() @ inputs.flatten(0, 1)
-        grad_weight_hh = flat.t() @ hiddens.flatten(0, 1)
-        return grad_inputs, None, grad_hidden, grad_cell, grad_weight_ih, grad_weight_hh, flat.sum(0)
+        grad_weight_hh = flat.t() @ hiddens.flatten(0, 1).to(low)
+        return grad_inputs, None, grad_hidden, grad_cell, grad_weight_ih, grad_weight_hh, grad_bias
 
 
 def lstm_weights(lstm: nn.LSTM) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -78,6 +99,8 @@ def lstm_weights(lstm: nn.LSTM) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Tensor, Tensor]) -> Tensor:
     """Outputs of a one-layer ``lstm`` (``batch_first``) whose state restarts from zero where ``init`` is set.
+
+    Under autocast matrix products have the lower precision; a CPU uses :class:`Gaps` then.
 
     Args:
         lstm: its parameters are used.
@@ -95,7 +118,78 @@ def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Te
         >>> torch.allclose(outputs, lstm(inputs)[0], atol=1e-6)
         True
     """
-    keep = (~init).to(inputs.dtype).t().unsqueeze(-1)  # [T, B, 1]
+    low = autocast_dtype(inputs)
+    if low is not None and on_host(init):
+        gaps = Gaps(init)
+        return gaps.remove(gaps.lstm(lstm, [gaps.insert(inputs)], state))
     weight_ih, weight_hh, bias_ih, bias_hh = lstm_weights(lstm)
+    keep = (~init).to(bias_ih.dtype).t().unsqueeze(-1)  # [T, B, 1]
     by_time = inputs.transpose(0, 1).contiguous()
+    if low is not None:
+        by_time, weight_ih, weight_hh = by_time.to(low), weight_ih.to(low), weight_hh.to(low)
     return _RestartingLSTM.apply(by_time, keep, *state, weight_ih, weight_hh, bias_ih + bias_hh).transpose(0, 1)
+
+
+class Gaps:
+    """Empty steps before the restarts of sequences; an LSTM's state is zero behind them.
+
+    A gap has an input of its own that closes the gates for writing, remembering and reading. So cell and output are
+    exactly zero there, and no gradient passes.
+
+    Args:
+        init: ``[B, T]`` bool; the state restarts before these steps. On a GPU the host waits for it.
+
+    Examples:
+        >>> inputs, init = torch.randn(2, 3, 5), torch.tensor([[True, False, True], [False, False, False]])
+        >>> lstm, zero, gaps = nn.LSTM(5, 4, batch_first=True), torch.zeros(2, 4), Gaps(init)
+        >>> gaps.insert(inputs).shape
+        torch.Size([8, 5])
+        >>> outputs = gaps.remove(gaps.lstm(lstm, [gaps.insert(inputs)], (zero, zero)))
+        >>> torch.allclose(outputs, restarting_lstm(lstm, inputs, init, (zero, zero)), atol=1e-6)
+        True
+    """
+
+    def __init__(self, init: Tensor) -> None:
+        batch, time = init.shape
+        restarts = init.cumsum(1)
+        before = restarts - restarts[:, :1]  # gaps before each step; at the first one the given state is dropped
+        self._keep = ~init[:, :1]
+        self._shape, self._gapped = (batch, time), (time + int(before[:, -1].max()), batch)
+        steps, rows = torch.arange(time, device=init.device), torch.arange(batch, device=init.device)
+        self._place = ((steps + before) * batch + rows.unsqueeze(1)).flatten()  # of each step in [L, B]
+        self._step = init.new_zeros(self._gapped, dtype=torch.int64).flatten()  # at each place, out of [B, T]
+        self._step[self._place] = torch.arange(batch * time, device=init.device)
+        self._is_gap = torch.ones_like(self._step, dtype=torch.bool)
+        self._is_gap[self._place] = False
+
+    def insert(self, steps: Tensor) -> Tensor:
+        """``[B, T, *]`` -> ``[L * B, *]``, by time. What stands at the gaps is some other step."""
+        return steps.flatten(0, 1)[self._step]
+
+    def remove(self, steps: Tensor) -> Tensor:
+        """``[L * B, *]`` -> ``[B, T, *]``."""
+        return steps[self._place].unflatten(0, self._shape)
+
+    def lstm(self, lstm: nn.LSTM, parts: list[Tensor], state: tuple[Tensor, Tensor]) -> Tensor:
+        """Outputs of a one-layer ``lstm``.
+
+        Args:
+            lstm: its parameters are used.
+            parts: its inputs, side by side, ``[L * B, *]`` each.
+            state: hidden and cell state before the first step, ``[B, H]`` each.
+
+        Returns:
+            ``[L * B, H]``.
+        """
+        weight_ih, weight_hh, bias_ih, bias_hh = lstm_weights(lstm)
+        padding = -(weight_ih.shape[1] + 1) % 8  # other widths cost oneDNN half its speed in bfloat16
+        closing = weight_ih.new_zeros((4, lstm.hidden_size, 1 + padding))
+        closing[:2, :, 0] = closing[3, :, 0] = CLOSED
+        flag = parts[0].new_zeros((len(self._is_gap), 1 + padding))
+        flag[:, 0] = self._is_gap
+        inputs = torch.cat([*(part.to(flag.dtype) for part in parts), flag], -1).unflatten(0, self._gapped)
+        weights = [torch.cat([weight_ih, closing.flatten(0, 1)], 1), weight_hh, bias_ih, bias_hh]
+        start = [(part * self._keep).unsqueeze(0) for part in state]
+        # has_biases, num_layers, dropout, train, bidirectional, batch_first
+        settings = True, 1, 0.0, torch.is_grad_enabled(), False, False
+        return torch.lstm(inputs, start, weights, *settings)[0].flatten(0, 1)

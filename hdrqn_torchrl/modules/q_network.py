@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
+from hdrqn_torchrl.devices import autocast_dtype, on_host
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
 
@@ -17,10 +18,23 @@ class DuelingHead(nn.Module):
 
     def __init__(self, in_features: int, num_actions: int) -> None:
         super().__init__()
-        self.streams = nn.Linear(in_features, 1 + num_actions)
+        self.streams = ExactLinear(in_features, 1 + num_actions)
 
     def forward(self, features: Tensor) -> Tensor:
         return dueling(self.streams(features))
+
+
+class ExactLinear(nn.Linear):
+    """A dense layer that keeps its precision under autocast.
+
+    It makes the Q-values: in a lower precision those that differ by little would become the same.
+    """
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        if autocast_dtype(inputs) is None:
+            return super().forward(inputs)
+        with torch.autocast(inputs.device.type, enabled=False):
+            return super().forward(inputs.to(self.weight.dtype))
 
 
 def dueling(streams: Tensor) -> Tensor:
@@ -133,7 +147,7 @@ class QNetwork(nn.Module):
         if not isinstance(self.memory, nn.LSTM):
             return self.evaluate(observation, condition)
         features = self._embed(observation, condition)
-        if init is not None and init[:, 1:].any():
+        if init is not None and not (on_host(init) and not init[:, 1:].any()):
             state = self.initial_state(len(features)) if state is None else state
             return self.head(restarting_lstm(self.memory, features, init, state))
         if state is None:

@@ -94,11 +94,11 @@ class TestNetwork:
 
     def test_values_are_dueling(self):
         """The mean over the actions is the value stream, and differences are those of the advantages."""
-        network, inputs = make_network(), sequences()
+        network, inputs = make_network(), sequences(rows=1)
         streams = []
         for head in (network.sub_head, network.meta_head):
             head.register_forward_hook(lambda _module, _inputs, output: streams.append(output))
-        action_value, subgoal_value, _ = network.unroll(*inputs)
+        action_value, subgoal_value, _ = network.step(*(steps[0] for steps in inputs), network.initial_state(9))
         sub, meta = streams[0].view(*action_value.shape[:-1], 1 + ACTIONS), streams[1]
         for value, stream in ((action_value, sub), (subgoal_value, meta)):
             torch.testing.assert_close(value.mean(-1), stream[..., 0], **EXACT)
