@@ -35,10 +35,9 @@ from hdrqn_torchrl.modules import (
     EpsilonGreedy,
     HierarchicalPolicy,
     MetaController,
-    ObservationPredictor,
     RepeatingEpsilonGreedy,
     SubController,
-    observation_decoder,
+    observation_predictor,
 )
 from hdrqn_torchrl.objectives import AllSubgoalsLoss, RecurrentDQNLoss
 from hdrqn_torchrl.transforms import SubgoalTransform
@@ -89,6 +88,7 @@ def make_recurrent_loss(
     *,
     gamma: float = 0.99,
     loss_keys: Mapping[str, NestedKey | None] | None = None,
+    prediction_weight: float = 0.1,
 ) -> RecurrentDQNLoss:
     """The loss of one level, as its settings have it.
 
@@ -97,6 +97,7 @@ def make_recurrent_loss(
         settings: how it learns.
         gamma: discount of one environment step.
         loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
+        prediction_weight: of the error of the network's predictor, if it has one.
 
     Raises:
         ValueError: if ``settings.stored_state`` is asked of a network without memory.
@@ -112,6 +113,8 @@ def make_recurrent_loss(
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
         state_keys=stored_states(network, settings),
+        predictor=network.network.predictor,
+        prediction_weight=prediction_weight,
     )
     loss.set_keys(**(loss_keys or {}))
     return loss
@@ -125,6 +128,8 @@ def make_drqn(
     exploration: EpsilonGreedy | None = None,
     gamma: float = 0.99,
     recurrent: bool = True,
+    prediction_steps: int = 0,
+    prediction_weight: float = 0.1,
 ) -> Algorithm:
     """Flat recurrent Q-learning (Hausknecht and Stone, 2015) on the task's total reward.
 
@@ -135,6 +140,7 @@ def make_drqn(
         exploration: its schedule.
         gamma: discount of one step.
         recurrent: ``False`` gives DQN.
+        prediction_steps, prediction_weight: as in :func:`make_v3`.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -144,7 +150,9 @@ def make_drqn(
     """
     exploration = exploration or EpsilonGreedy()
     observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
-    network = architecture.q_network(observation, num_actions=num_actions, recurrent=recurrent)
+    network = architecture.q_network(
+        observation, num_actions=num_actions, recurrent=recurrent, prediction_steps=prediction_steps
+    )
     policy = SubController(network, exploration, subgoal_key=None, init_key=keys.IS_INIT).to(env.device)
     flat = Learner(
         policy,
@@ -153,7 +161,7 @@ def make_drqn(
             root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
             next_keys=[keys.OBSERVATION, keys.REWARD],
         ),
-        loss=make_recurrent_loss(policy, learner, gamma=gamma),
+        loss=make_recurrent_loss(policy, learner, gamma=gamma, prediction_weight=prediction_weight),
         num_envs=env.batch_size[0],
     )
     return Algorithm(
@@ -189,6 +197,8 @@ def make_hdrqn(
     max_option_steps: int | None = None,
     sub_hindsight: bool = False,
     meta_hindsight: bool = False,
+    prediction_steps: int = 0,
+    prediction_weight: float = 0.1,
     recurrent: bool = True,
 ) -> Algorithm:
     r"""Hierarchical deep recurrent Q-learning (Algorithm 1).
@@ -216,6 +226,7 @@ def make_hdrqn(
             minibatch then holds ``sub.batch_size`` times the number of subgoals.
         meta_hindsight: learn from options as if they had been chosen for what they attained, too
             (:class:`~hdrqn_torchrl.data.HindsightOptions`).
+        prediction_steps, prediction_weight: of the sub-controller's memory, as in :func:`make_v3`.
         recurrent: ``False`` gives hDQN (with ``version="v1"``).
 
     Raises:
@@ -261,7 +272,13 @@ def make_hdrqn(
     meta_inputs = len(meta_keys) * architecture.hidden_size if version == "v2" else observation
 
     sub_controller = SubController(
-        architecture.q_network(observation, num_actions=num_actions, num_conditions=num_subgoals, recurrent=recurrent),
+        architecture.q_network(
+            observation,
+            num_actions=num_actions,
+            num_conditions=num_subgoals,
+            recurrent=recurrent,
+            prediction_steps=prediction_steps,
+        ),
         sub_exploration,
     )
     meta_controller = MetaController(
@@ -312,6 +329,7 @@ def make_hdrqn(
                 "init": keys.OPTION_INIT,
                 "eligible": keys.ELIGIBLE if sub_hindsight else None,
             },
+            prediction_weight=prediction_weight,
         ),
         num_envs=env.batch_size[0],
         refresh=relabel,
@@ -433,13 +451,7 @@ def make_v3(
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
     predictor = None
     if prediction_steps:
-        predictor = ObservationPredictor(
-            observation_decoder(observation),
-            hidden_size=memory_size,
-            num_actions=num_actions,
-            max_steps=prediction_steps,
-            width=head_size,
-        )
+        predictor = observation_predictor(observation, memory_size, num_actions, prediction_steps, width=head_size)
     network = AllSubgoalsNetwork(
         architecture.observation_features(observation),
         num_actions=num_actions,

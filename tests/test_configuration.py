@@ -18,6 +18,7 @@ import configuration
 from configuration import (
     ALLOWED_TARGETS,
     SettingsError,
+    build_algorithm,
     check,
     check_targets,
     command_line,
@@ -130,6 +131,25 @@ class TestCheckTargets:
         check_targets(settings, ["my_package.MyEnv"])
         settings.allowed_targets = ["my_package.MyEnv"]
         check(settings)
+
+
+VARIANTS = sorted(path.stem for path in (Path(CONF) / "variant").glob("*.yaml"))
+
+
+class TestVariants:
+    @pytest.mark.parametrize("name", VARIANTS)
+    def test_each_can_be_built_and_differs_from_its_algorithm(self, name):
+        small = ["env.num_envs=4", "network.hidden_size=8", "network.widths=[8]"]
+        with initialize_config_dir(CONF, version_base="1.3"):
+            config = compose("config", overrides=[f"variant={name}", *small])
+            plain = compose("config", overrides=[f"algo={name.split('_')[0]}", *small])
+        check(config)
+        build_algorithm(config)
+        assert (config.algo != plain.algo) == ("_" in name)
+
+    def test_the_ablation_is_over_all_of_them(self):
+        sweep = OmegaConf.load(Path(CONF) / "experiment" / "ablation.yaml").hydra.sweeper.params
+        assert sorted(sweep.variant.split(",")) == VARIANTS
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Networks, controllers and exploration as (TensorDict) modules."""
 
 from hdrqn_torchrl.modules.all_subgoals import AllSubgoalsNetwork, AllSubgoalsPolicy
-from hdrqn_torchrl.modules.architectures import Architecture, compact_network, observation_decoder, paper_network
+from hdrqn_torchrl.modules.architectures import Architecture, compact_network, observation_predictor, paper_network
 from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
@@ -27,6 +27,6 @@ __all__ = [
     "RepeatingEpsilonGreedy",
     "SubController",
     "compact_network",
-    "observation_decoder",
+    "observation_predictor",
     "paper_network",
 ]

@@ -15,7 +15,7 @@ from hdrqn_torchrl.modules.features import (
     Features,
     FullyConnectedFeatures,
 )
-from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, DecoderFactory, ImageDecoder
+from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, ImageDecoder, ObservationPredictor
 from hdrqn_torchrl.modules.q_network import QNetwork
 
 
@@ -36,9 +36,21 @@ class Architecture:
     vector_features: Callable[[int], Features]
 
     def q_network(
-        self, inputs: TensorSpec | int, *, num_actions: int, num_conditions: int = 0, recurrent: bool = True
+        self,
+        inputs: TensorSpec | int,
+        *,
+        num_actions: int,
+        num_conditions: int = 0,
+        recurrent: bool = True,
+        prediction_steps: int = 0,
     ) -> QNetwork:
-        """A Q-network for an observation spec or a vector of given size."""
+        """A Q-network for an observation spec or a vector of given size.
+
+        Its memory can learn to predict up to ``prediction_steps`` steps ahead what will be seen.
+        """
+        predictor = None
+        if prediction_steps and not isinstance(inputs, int):
+            predictor = observation_predictor(inputs, self.hidden_size, num_actions, prediction_steps)
         return QNetwork(
             self.vector_features(inputs) if isinstance(inputs, int) else self.observation_features(inputs),
             num_actions=num_actions,
@@ -46,6 +58,7 @@ class Architecture:
             num_conditions=num_conditions,
             gate_features=self.gate_features,
             recurrent=recurrent,
+            predictor=predictor,
         )
 
 
@@ -101,12 +114,16 @@ def is_grid(spec: TensorSpec) -> bool:
     return isinstance(spec, Categorical)
 
 
-def observation_decoder(spec: TensorSpec) -> DecoderFactory:
-    """Makes decoders for an observation spec: they guess cell codes, or a coarse image."""
+def observation_predictor(
+    spec: TensorSpec, hidden_size: int, num_actions: int, max_steps: int, width: int = 128
+) -> ObservationPredictor:
+    """A predictor for an observation spec: it guesses cell codes, or a coarse image."""
 
-    def make(in_features: int) -> Decoder:
+    def decoder(in_features: int) -> Decoder:
         if is_grid(spec):
             return CellDecoder(in_features, spec.shape[-1], spec.n)
         return ImageDecoder(in_features, spec.shape[-3])
 
-    return make
+    return ObservationPredictor(
+        decoder, hidden_size=hidden_size, num_actions=num_actions, max_steps=max_steps, width=width
+    )

@@ -95,8 +95,10 @@ class SubController(TensorDictModuleBase):
         init = tensordict.get(self.init_key)  # [*batch, 1]
         if recurrent_mode():
             state = first_state(tensordict, self.state_keys)
-            value = self.network.unroll(observation, subgoal, init.squeeze(-1), state)
-            return tensordict.set(self.action_value_key, value)
+            memory = self.network.remember(observation, subgoal, init.squeeze(-1), state)
+            if self.network.predictor is not None:
+                tensordict.set(self.hidden_key, memory)
+            return tensordict.set(self.action_value_key, self.network.head(memory))
         if not self.network.recurrent:
             return tensordict.set(
                 self.action_key, self._choose(self.network.evaluate(observation, subgoal), tensordict)

@@ -9,6 +9,7 @@ from torch.nn.utils.rnn import pack_padded_sequence
 from hdrqn_torchrl.devices import autocast_dtype, on_host
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
+from hdrqn_torchrl.modules.prediction import ObservationPredictor
 
 State = tuple[Tensor, Tensor]
 
@@ -55,6 +56,7 @@ class QNetwork(nn.Module):
         gate_features: let the condition scale each feature, too, by learned factors. Appended alone it is a faint
             signal: "go to goal k" needs the product of what is seen and which goal is wanted.
         recurrent: ``False`` replaces the LSTM by a dense layer with ReLU.
+        predictor: a second task for the memory; not used in acting.
 
     Examples:
         >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
@@ -76,12 +78,16 @@ class QNetwork(nn.Module):
         num_conditions: int = 0,
         gate_features: bool = False,
         recurrent: bool = True,
+        predictor: ObservationPredictor | None = None,
     ) -> None:
         super().__init__()
+        if predictor is not None and not recurrent:
+            raise ValueError("predictor must be None with recurrent=False: there is no memory to teach.")
         if hidden_size < 1:
             raise ValueError(f"hidden_size must be >= 1, got {hidden_size}; the paper uses 256.")
         self.features, self.hidden_size, self.recurrent = features, hidden_size, recurrent
         self.num_actions, self.num_conditions = num_actions, num_conditions
+        self.predictor = predictor
         size = features.out_features + num_conditions
         if recurrent:
             self.memory: nn.Module = nn.LSTM(size, hidden_size, batch_first=True)
@@ -144,17 +150,27 @@ class QNetwork(nn.Module):
         Returns:
             ``[B, T, A]``.
         """
-        if not isinstance(self.memory, nn.LSTM):
-            return self.evaluate(observation, condition)
+        return self.head(self.remember(observation, condition, init, state))
+
+    def remember(
+        self,
+        observation: Tensor,
+        condition: Tensor | None = None,
+        init: Tensor | None = None,
+        state: State | None = None,
+    ) -> Tensor:
+        """What the Q-values of :meth:`unroll` are read from: the recurrent layer's output, ``[B, T, H]``."""
         features = self._embed(observation, condition)
+        if not isinstance(self.memory, nn.LSTM):
+            return self.memory(features)
         if init is not None and not (on_host(init) and not init[:, 1:].any()):
             state = self.initial_state(len(features)) if state is None else state
-            return self.head(restarting_lstm(self.memory, features, init, state))
+            return restarting_lstm(self.memory, features, init, state)
         if state is None:
-            return self.head(self.memory(features)[0])
+            return self.memory(features)[0]
         if init is not None:
             state = state[0].masked_fill(init[:, :1], 0.0), state[1].masked_fill(init[:, :1], 0.0)
-        return self.head(self.memory(features, (state[0][None].contiguous(), state[1][None].contiguous()))[0])
+        return self.memory(features, (state[0][None].contiguous(), state[1][None].contiguous()))[0]
 
     def final_state(self, observation: Tensor, condition: Tensor | None, lengths: Tensor) -> State:
         """State at the end of sequences of different lengths that start from the zero state.

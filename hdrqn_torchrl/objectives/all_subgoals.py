@@ -39,6 +39,7 @@ from torchrl.objectives.utils import distance_loss
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
 from hdrqn_torchrl.modules.exploration import mask_values
+from hdrqn_torchrl.objectives.prediction import prediction_loss
 from hdrqn_torchrl.objectives.targets import (
     double_q_value,
     importance_weight,
@@ -204,9 +205,9 @@ class AllSubgoalsLoss(LossModule):
             }
         losses = {"loss": sub_loss + meta_loss, "sub_loss": sub_loss.detach(), "meta_loss": meta_loss.detach()}
         if self._predicts:
-            prediction_loss = self._prediction_loss(memory, tensordict, valid)
-            losses["loss"] = losses["loss"] + self.prediction_weight * prediction_loss
-            losses["prediction_loss"] = prediction_loss.detach()
+            prediction_error = self._prediction_loss(memory, tensordict, valid)
+            losses["loss"] = losses["loss"] + self.prediction_weight * prediction_error
+            losses["prediction_loss"] = prediction_error.detach()
         return TensorDict({**losses, **report}, [])
 
     @property
@@ -214,14 +215,16 @@ class AllSubgoalsLoss(LossModule):
         return self._policies[0].network.predictor is not None and self.prediction_weight > 0.0
 
     def _prediction_loss(self, memory: Tensor, tensordict: TensorDictBase, valid: Tensor) -> Tensor:
-        """Mean error over the steps whose next ``ahead`` steps are of the same episode."""
+        """Mean error of predictions within an episode."""
         policy = self._policies[0]
-        predictor = policy.network.predictor
-        ahead = int(torch.randint(1, min(predictor.max_steps, tensordict.shape[1] - 1) + 1, ()))
-        observation, action = tensordict[policy.observation_key], tensordict[self.tensor_keys.action]
-        error = predictor(memory, action, observation, steps=ahead)
-        begins = tensordict[policy.init_key].squeeze(-1)[:, 1:]
-        return _masked_mean(error, valid[:, ahead:] & ~begins.unfold(1, ahead, 1).any(-1))
+        return prediction_loss(
+            policy.network.predictor,
+            memory,
+            tensordict[self.tensor_keys.action],
+            tensordict[policy.observation_key],
+            valid=valid,
+            cut=tensordict[policy.init_key].squeeze(-1)[:, 1:],
+        )
 
     def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Tensor]:
         """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network; the main

@@ -17,6 +17,8 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules import ObservationPredictor
+from hdrqn_torchrl.objectives.prediction import prediction_loss
 from hdrqn_torchrl.objectives.targets import (
     check_returns,
     double_q_value,
@@ -62,6 +64,8 @@ class RecurrentDQNLoss(LossModule):
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
         max_target: targets are cut off above this value: the largest return there can be, where it is known. It
             stops the overestimation that bootstrapping builds up while rewards are still rare.
+        predictor: part of the value network that predicts observations from its memory; its error joins the loss.
+        prediction_weight: of that error.
         trace_decay: lambda of Watkins' Q(lambda): a target takes over this share of the next step's own target, if
             the next action is the main network's greedy one. 0 is the one-step target.
         n_step: rewards before the value; 1 is the one-step target. Later actions are taken as they came, exploratory
@@ -73,7 +77,8 @@ class RecurrentDQNLoss(LossModule):
     Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
     ``steps`` (under ``"next"``, ``None``: 1); ``init`` (restart of the state); ``mask`` (padding);
     ``action_mask`` (choices that exist, ``None``: all); ``eligible`` (steps that may enter the loss, ``None``: all;
-    unlike padding they are read, and may lie anywhere); ``priority_weight`` (of sequences drawn by priority).
+    unlike padding they are read, and may lie anywhere); ``priority_weight`` (of sequences drawn by priority);
+    for a predictor ``observation``, ``memory`` (what the network writes) and ``episode_done`` (under ``"next"``).
 
     Returns (``forward``): ``loss`` (scalar), and without gradient ``td_error`` (mean absolute), ``q_value`` and
     ``target`` (means), ``trained_steps`` (how many steps entered the loss), ``priority`` (of each
@@ -103,6 +108,9 @@ class RecurrentDQNLoss(LossModule):
         mask: NestedKey = keys.PAD_MASK
         priority_weight: NestedKey = "priority_weight"
         action_mask: NestedKey | None = None
+        observation: NestedKey = keys.OBSERVATION
+        memory: NestedKey = keys.SUB_HIDDEN
+        episode_done: NestedKey = keys.DONE
         eligible: NestedKey | None = None
 
     tensor_keys: _AcceptedKeys
@@ -124,6 +132,8 @@ class RecurrentDQNLoss(LossModule):
         double: bool = True,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
         max_target: float | None = None,
+        predictor: ObservationPredictor | None = None,
+        prediction_weight: float = 0.1,
         trace_decay: float = 0.0,
         n_step: int = 1,
         state_keys: Sequence[NestedKey] = (),
@@ -154,6 +164,10 @@ class RecurrentDQNLoss(LossModule):
         self.burn_in, self.train_exact_states = burn_in, train_exact_states
         self.double, self.loss_function, self.max_target = double, loss_function, max_target
         self.trace_decay, self.n_step = trace_decay, n_step
+        self.__dict__["_predictor"] = predictor  # its parameters are the network's
+        self.prediction_weight = prediction_weight
+        if predictor is not None:
+            self.out_keys = [*self.out_keys, "prediction_loss"]
         self.state_keys = list(state_keys)
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
@@ -185,7 +199,7 @@ class RecurrentDQNLoss(LossModule):
         done, terminated = _steps_of(after[k.done], tensordict), _steps_of(after[k.terminated], tensordict)
 
         inputs = self._inputs(tensordict, valid, init)
-        online, target = self._action_values(inputs)
+        online, target, memory = self._action_values(inputs)
         chosen = online[:, :-1].gather(-1, tensordict[k.action].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
             allowed = None if k.action_mask is None else inputs.get(k.action_mask)
@@ -227,7 +241,25 @@ class RecurrentDQNLoss(LossModule):
                 "trained_steps": trained.sum(),
                 "priority": sequence_priority(wanted - chosen, trained),
             }
+        if self._predictor is not None and memory is not None:
+            prediction_error = self._prediction_loss(memory, inputs, tensordict, valid)
+            loss = loss + self.prediction_weight * prediction_error
+            report["prediction_loss"] = prediction_error.detach()
         return TensorDict({"loss": loss, **report}, [])
+
+    def _prediction_loss(
+        self, memory: Tensor, inputs: TensorDictBase, tensordict: TensorDictBase, valid: Tensor
+    ) -> Tensor:
+        """Mean error of predictions within an episode; options may end on the way."""
+        k = self.tensor_keys
+        return prediction_loss(
+            self._predictor,
+            memory,
+            tensordict[k.action],
+            inputs[k.observation],
+            valid=torch.cat([valid[:, :1], valid], 1),
+            cut=_steps_of(tensordict["next", k.episode_done], tensordict),
+        )
 
     def _longer_targets(
         self, reward: Tensor, ended: Tensor, next_value: Tensor, discount: Tensor, *, follows: Tensor, greedy: Tensor
@@ -261,14 +293,15 @@ class RecurrentDQNLoss(LossModule):
         restart = torch.cat([init, torch.zeros_like(init[:, :1])], 1)
         return inputs.set(k.init, restart.unsqueeze(-1))
 
-    def _action_values(self, inputs: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Q-values ``[B, T + 1, A]`` of main and target network."""
+    def _action_values(self, inputs: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Q-values ``[B, T + 1, A]`` of main and target network; if it predicts, the main one's memory."""
         network, target_network = self._networks
         key = self.tensor_keys.action_value
         with set_recurrent_mode(True):
             with torch.no_grad():
                 target = target_network(inputs.copy()).get(key)
-            return network(inputs.copy()).get(key), target
+            online = network(inputs.copy())
+        return online.get(key), target, online.get(self.tensor_keys.memory, None)
 
 
 def _steps_of(value: Tensor, tensordict: TensorDictBase) -> Tensor:

@@ -3,7 +3,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import parameter_distance, unroll_by_steps
+from helpers import build, collect, parameter_distance, small_env, tiny_settings, unroll_by_steps
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
@@ -655,3 +655,70 @@ class TestKeys:
     def test_wrong_values(self, settings, message):
         with pytest.raises(ValueError, match=message):
             RecurrentDQNLoss(make_controller(), **settings)
+
+
+class TestPrediction:
+    """A second task for the memory of a network that has a predictor."""
+
+    def sample(self, name="v2", **options):
+        torch.manual_seed(0)
+        env = small_env(8, max_steps=6)
+        settings = tiny_settings(slice_len=5, batch_size=64, burn_in=0.0)
+        algorithm = build(name, env, settings=settings, prediction_steps=3, prediction_weight=0.5, **options)
+        learner = next(iter(algorithm.learners.values()))
+        for batch in collect(algorithm, env, 20, batches=2):
+            learner.store(batch)
+        return learner.loss, learner.sample(), learner.network.network
+
+    @pytest.mark.parametrize("name", ["v2", "v1", "drqn"])
+    def test_what_is_expected_within_the_episode_enters_the_loss(self, name):
+        loss, sample, network = self.sample(name)
+        rows, steps = sample.shape
+        valid, done = sample["collector", "mask"], sample["next", "done"].squeeze(-1)
+        seen, padded = set(), 0
+        for seed in range(8):
+            torch.manual_seed(seed)
+            ahead = int(torch.randint(1, 4, ()))
+            torch.manual_seed(seed)
+            result = loss(sample)
+            with torch.no_grad():
+                inputs = loss._inputs(sample, valid, _init_of(loss, sample) & valid)
+                memory = loss._action_values(inputs)[2]
+                errors = network.predictor(memory, sample["action"], inputs["observation"], steps=ahead)
+            kept = [
+                errors[b, t].item()
+                for b in range(rows)
+                for t in range(steps + 1 - ahead)
+                if valid[b, t : t + ahead].all() and not done[b, t : t + ahead].any()
+            ]
+            padded += errors.numel() - len(kept)
+            assert result["prediction_loss"].item() == pytest.approx(sum(kept) / len(kept), rel=1e-4)
+            assert set(result.keys()) == set(loss.out_keys)
+            seen.add(ahead)
+        assert seen == {1, 2, 3} and padded > 0
+
+    def test_it_trains_the_memory_and_the_predictor(self):
+        loss, sample, network = self.sample()
+        with torch.no_grad():
+            network.head.streams.weight.zero_()  # no way to the memory through the values
+        loss(sample)["loss"].backward()
+        for part in (network.memory, network.predictor.decoder):
+            assert all((p.grad != 0).any() for p in part.parameters())
+
+    def test_the_weight_is_that_of_its_error(self):
+        loss, sample, _ = self.sample()
+        total = []
+        for weight in (0.0, 1.0):
+            torch.manual_seed(0)
+            loss.prediction_weight = weight
+            result = loss(sample)
+            total.append(result["loss"].item())
+        assert total[1] - total[0] == pytest.approx(result["prediction_loss"].item(), rel=1e-4)
+
+    def test_a_network_without_memory_has_none(self):
+        with pytest.raises(ValueError, match="predictor must be None with recurrent=False"):
+            build("hdqn", small_env(4), prediction_steps=1)
+
+
+def _init_of(loss, sample):
+    return sample[loss.tensor_keys.init].squeeze(-1)

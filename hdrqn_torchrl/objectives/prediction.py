@@ -1,0 +1,36 @@
+"""The error of a memory's predictions along sequences."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hdrqn_torchrl.modules import ObservationPredictor
+
+
+def prediction_loss(
+    predictor: ObservationPredictor,
+    memory: Tensor,
+    action: Tensor,
+    observation: Tensor,
+    *,
+    valid: Tensor,
+    cut: Tensor,
+) -> Tensor:
+    """Mean error of what the predictor expects some steps ahead, how many is drawn anew at each call.
+
+    Args:
+        predictor: the predictor.
+        memory: output of the LSTM ``[B, T + 1, H]``.
+        action: ``[B, T]`` int64, or one more.
+        observation: ``[B, T + 1, ...]``.
+        valid: what is no padding, ``[B, T + 1]`` bool; padding only follows valid steps.
+        cut: where the next observation is not what the step led to, ``[B, T]`` bool.
+
+    Returns:
+        Scalar; 0 if nothing could be predicted.
+    """
+    ahead = int(torch.randint(1, min(predictor.max_steps, cut.shape[1]) + 1, ()))  # by the host, from its generator
+    error = predictor(memory, action, observation, steps=ahead)
+    known = valid[:, ahead:] & ~cut.unfold(1, ahead, 1).any(-1)
+    return error.masked_fill(~known, 0.0).sum() / known.sum().clamp(min=1)
