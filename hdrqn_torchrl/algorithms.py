@@ -393,6 +393,7 @@ def make_v3(
     memory_size: int = 128,
     head_size: int = 128,
     joint: bool = True,
+    meta_learning_rate: float | None = None,
     sub_gamma: float = 0.95,
     meta_gamma: float = 0.97,
     trace_decay: float = 0.8,
@@ -415,7 +416,9 @@ def make_v3(
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
         memory_size: H, size of the LSTM.
         head_size: units of the heads' hidden layers.
-        joint: whether the meta level trains the memory, too.
+        joint: whether the meta level trains the memory, too; ``False``: it reads the memory only, and its head has an
+            optimiser of its own.
+        meta_learning_rate: of that optimiser, following the same schedule; ``None``: ``learner.learning_rate``.
         sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, wrong_subgoal_reward, hazard_reward,
             max_meta_target, prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
         max_option_steps: step limit of an option.
@@ -447,6 +450,9 @@ def make_v3(
             f"max_target must be None for v3, got {learner.max_target}; its levels are bounded apart: the sub level by "
             "the reward for reaching the subgoal, the meta level by max_meta_target."
         )
+    if joint and meta_learning_rate is not None:
+        raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
+    meta_rate = learner.learning_rate if meta_learning_rate is None else meta_learning_rate
     observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
     predictor = None
@@ -492,7 +498,15 @@ def make_v3(
         ],
         next_keys=[keys.ATTAINED, keys.HAZARD, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
     )
-    trained = Learner(policy, learner, extract=stored, loss=loss, lookahead=1, num_envs=env.batch_size[0])
+    trained = Learner(
+        policy,
+        learner,
+        extract=stored,
+        loss=loss,
+        lookahead=1,
+        num_envs=env.batch_size[0],
+        separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
+    )
 
     def make_transforms() -> Compose:
         subgoals = SubgoalTransform(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torch.nn import Parameter
 from torchrl.objectives import LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
@@ -161,6 +162,8 @@ class Learner:
         lookahead: steps that a minibatch's sequences have beyond ``slice_len``.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
         refresh: applied to every minibatch before it is learned from.
+        separate: parts of the network, by how the names of their parameters begin, that are optimised apart: with
+            this share of the learning rate, and with gradients clipped by their own norm.
         samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
             and one large draw costs little more than a small one. Priorities are those of
             the draw: up to ``samples_per_draw - 1`` updates old.
@@ -179,6 +182,7 @@ class Learner:
         lookahead: int = 0,
         num_envs: int | None = None,
         refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        separate: Mapping[str, float] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
         self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
@@ -190,7 +194,13 @@ class Learner:
         self.device = next(iter(self._parameters.values())).device
         self.precision = choose_precision(settings.precision, network)
         self.guard = FiniteGuard(at_once=self.device.type == "cpu")
-        self.optimizer = torch.optim.Adam(self._parameters.values(), lr=settings.learning_rate, fused=True)
+        self.updates, self.frames = 0, 0
+        groups = _group(self._parameters, separate or {})
+        self._rates = [rate for rate, _ in groups]
+        self.optimizer = torch.optim.Adam(
+            [{"params": parameters} for _, parameters in groups], lr=settings.learning_rate, fused=True
+        )
+        self._set_learning_rate()
         self._sequence_len = settings.slice_len + lookahead
         self.buffer = make_sequence_buffer(
             settings.capacity,
@@ -203,7 +213,6 @@ class Learner:
             device=self.device,
         )
         self._drawn: list[TensorDictBase] = []
-        self.updates, self.frames = 0, 0
         self._warm_at = settings.warmup_frames  # or when the first transition came, if that is later
 
     @property
@@ -213,13 +222,16 @@ class Learner:
         progress = min(1.0, self.frames / self.settings.learning_rate_frames)
         return start if end is None else start + (end - start) * progress
 
+    def _set_learning_rate(self) -> None:
+        for share, group in zip(self._rates, self.optimizer.param_groups, strict=True):
+            group["lr"] = share * self.learning_rate
+
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
         self.check_finite()
         self.frames += batch.numel()
         self._drawn = []
-        for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate
+        self._set_learning_rate()
         transitions = self.extract(batch)
         if transitions is not None:
             if not len(self.buffer):
@@ -257,7 +269,7 @@ class Learner:
         metrics["loss"].backward()
         norm = self._watch_gradients(metrics["loss"])
         if self.settings.max_grad_norm is not None:
-            torch.nn.utils.clip_grads_with_norm_(self._parameters.values(), self.settings.max_grad_norm, norm)
+            self._clip_gradients(self.settings.max_grad_norm, norm)
             metrics["grad_norm"] = norm
         self.optimizer.step()
         self.target_updater.step()
@@ -274,6 +286,14 @@ class Learner:
         if skip is not None:
             self.optimizer.found_inf = skip  # type: ignore[attr-defined]  # read by torch's fused Adam
         return norm
+
+    def _clip_gradients(self, largest: float, norm: Tensor) -> None:
+        """Clips the gradients of each part for itself; ``norm`` is that of all together."""
+        groups = [group["params"] for group in self.optimizer.param_groups]
+        for parameters in groups:
+            if len(groups) > 1:
+                norm = torch.nn.utils.get_total_norm([each.grad for each in parameters if each.grad is not None])
+            torch.nn.utils.clip_grads_with_norm_(parameters, largest, norm)
 
     def check_finite(self) -> None:
         """Looks at all updates since the last call, on devices where :meth:`update` does not look at each.
@@ -310,3 +330,19 @@ class Learner:
         self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
         if self.settings.precision == "auto":  # another machine might choose another one
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
+
+
+def _group(parameters: Mapping[str, Parameter], separate: Mapping[str, float]) -> list[tuple[float, list[Parameter]]]:
+    """Shares of the learning rate and whose they are: all that is not separate first."""
+    groups: dict[str, tuple[float, list[Parameter]]] = {name: (rate, []) for name, rate in separate.items()}
+    rest: list[Parameter] = []
+    for name, parameter in parameters.items():
+        part = next((each for each in separate if name.startswith(each)), None)
+        (rest if part is None else groups[part][1]).append(parameter)
+    for name, (rate, members) in groups.items():
+        if not members or rate <= 0:
+            raise ValueError(
+                f"separate must map beginnings of parameters' names to shares > 0 of the learning rate, got "
+                f"{name!r}: {rate}, which {len(members)} parameters have; look at network.named_parameters()."
+            )
+    return [(1.0, rest), *groups.values()]

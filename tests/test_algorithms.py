@@ -526,6 +526,14 @@ class TestV3:
         for first, second in both:
             torch.testing.assert_close(first, second)
 
+    def test_a_meta_level_that_only_reads_the_memory_has_its_own_optimiser(self):
+        learner = self.make(joint=False, meta_learning_rate=1e-4, learner={"learning_rate": 1e-3}).learners["joint"]
+        rest, head = learner.optimizer.param_groups
+        assert (rest["lr"], head["lr"]) == pytest.approx((1e-3, 1e-4))
+        assert {id(p) for p in head["params"]} == {id(p) for p in learner.network.network.meta_head.parameters()}
+        with pytest.raises(ValueError, match=r"meta_learning_rate must be None with joint=True, got 0\.1"):
+            self.make(meta_learning_rate=0.1)
+
     def test_settings_of_the_loss_reach_it(self):
         changes = {"burn_in": 0.25, "loss_function": "smooth_l1", "double": False}
         loss = self.make(learner=changes).learners["joint"].loss

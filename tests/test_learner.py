@@ -11,7 +11,7 @@ from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
 
 
-def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, **settings):
+def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, separate=None, **settings):
     torch.manual_seed(0)
     network = QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=2, hidden_size=6)
     controller = SubController(network, subgoal_key=None, init_key="is_init")
@@ -24,6 +24,7 @@ def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, **settings):
         loss=make_recurrent_loss(controller, settings),
         num_envs=num_envs,
         samples_per_draw=samples_per_draw,
+        separate=separate,
     )
 
 
@@ -447,3 +448,47 @@ class TestNumbersThatAreNone:
         for parameter in learner.network.parameters():
             parameter.register_hook(lambda gradient: torch.full_like(gradient, 3e38))
         self.check_nothing_was_learned(learner, sample, "^the gradient's norm became infinite in update 2, frame 16$")
+
+
+class TestSeparateParts:
+    """Parts of a network that are optimised apart."""
+
+    def updated(self, separate, **settings):
+        """Which share of a parameter's first step each part made, and the gradients it was made with."""
+        learner = make_learner(separate=separate, **settings)
+        learner.store(make_batch())
+        sample = learner.sample()
+        before = {name: p.detach().clone() for name, p in learner.network.named_parameters()}
+        metrics = learner.update(sample)
+        steps = {name: (p - before[name]).abs().max().item() for name, p in learner.network.named_parameters()}
+        return steps, metrics, {name: p.grad for name, p in learner.network.named_parameters()}
+
+    def test_each_has_its_rate(self):
+        """Adam's first step is as long as its rate."""
+        steps, _, _ = self.updated({"network.head": 0.25}, learning_rate=0.01)
+        for name, step in steps.items():
+            assert step == pytest.approx(0.0025 if "head" in name else 0.01, rel=1e-3)
+
+    def test_rates_follow_the_schedule(self):
+        schedule = {"learning_rate": 0.01, "learning_rate_end": 0.001, "learning_rate_frames": 16}
+        learner = make_learner(separate={"network.head": 0.5}, **schedule)
+        rates = [group["lr"] for group in learner.optimizer.param_groups]
+        learner.store(make_batch())
+        rates += [group["lr"] for group in learner.optimizer.param_groups]
+        assert rates == pytest.approx([0.01, 0.005, 0.001, 0.0005])
+
+    def test_each_is_clipped_by_its_own_norm(self):
+        _, metrics, together = self.updated(None, max_grad_norm=1e-3)
+        _, same, apart = self.updated({"network.head": 1.0}, max_grad_norm=1e-3)
+        assert metrics["grad_norm"] == same["grad_norm"] > 1e-3
+
+        def norm(gradients, part):
+            return torch.stack([g.norm() for name, g in gradients.items() if ("head" in name) == part]).norm().item()
+
+        assert norm(together, True) ** 2 + norm(together, False) ** 2 == pytest.approx(1e-6, rel=1e-2)
+        assert norm(apart, True) == pytest.approx(1e-3, rel=1e-2) == norm(apart, False)
+
+    @pytest.mark.parametrize("separate", [{"network.haed": 1.0}, {"network.head": 0.0}], ids=str)
+    def test_wrong_values(self, separate):
+        with pytest.raises(ValueError, match="separate must map beginnings of parameters' names to shares > 0"):
+            make_learner(separate=separate)
