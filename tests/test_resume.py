@@ -24,7 +24,6 @@ TRAININGS = {
     "v2": partial(make_training, name="v2"),
     "v2-refreshed": partial(make_training, name="v2", options={"refresh_hidden_steps": 7}),
     "v3": partial(make_training, name="v3"),
-    "drqn-r2d2": partial(make_training, name="drqn", learner={"stored_state": True, "priority_exponent": 0.9}),
     "v1-r2d2": partial(
         make_training, name="v1", learner={"stored_state": True, "priority_exponent": 0.9, "slice_len": 2}
     ),
