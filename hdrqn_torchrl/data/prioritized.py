@@ -18,7 +18,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
     r"""Slices that start at a step with probability :math:`p^\alpha / \sum p^\alpha`, where p is that step's priority.
 
     TorchRL's ``PrioritizedSliceSampler`` joins episodes, and the newest steps to the oldest, once a storage [time,
-    environment] is full, takes 0.4 s after every write at 200,000 steps, and has a state that only pickle can save; so
+    environment] is full, takes 0.3 s after every write at 200,000 steps, and has a state that only pickle can save; so
     its ``PrioritizedSampler`` draws the starts alone here, among those whose slice is complete: long enough, or ended
     by its episode. A new start has the largest priority there ever was, at least 1.
 
