@@ -1,5 +1,5 @@
 from copy import deepcopy
-from functools import partial
+from functools import cache
 
 import pytest
 import torch
@@ -324,14 +324,20 @@ STORED = [{**settings, "stored_state": True} for settings in FLAT + PRIORITISED 
 OPTIONS = [settings for settings in FLAT + PRIORITISED + STORED if settings["sampling"] != "episode_starts"]
 
 
+@cache
+def played(make):
+    """Batches of an algorithm that is made by ``make``."""
+    torch.manual_seed(0)
+    env = small_env(8)
+    return collect(make(env, NETWORKS["compact"]), env, 10, batches=3)
+
+
 class TestSequences:
     """Every way to draw sequences, with every level that takes it."""
 
     @pytest.mark.parametrize("settings", FLAT + PRIORITISED + STORED, ids=str)
-    @pytest.mark.parametrize("name", ["drqn", "v1"])
-    def test_of_steps(self, name, settings):
-        level = {"drqn": "learner", "v1": "sub"}[name]
-        make = {"drqn": make_drqn, "v1": partial(make_hdrqn, version="v1")}[name]
+    @pytest.mark.parametrize(("make", "level"), [(make_drqn, "learner"), (make_hdrqn, "sub")], ids=["drqn", "v2"])
+    def test_of_steps(self, make, level, settings):
         self.check(make, level, settings)
 
     @pytest.mark.parametrize("settings", OPTIONS, ids=str)
@@ -343,20 +349,16 @@ class TestSequences:
         self.check(make_v3, "learner", settings)
 
     def check(self, make, level, settings):
-        torch.manual_seed(0)
-        env = small_env(8)
-        learner_settings = tiny_settings(batch_size=16, **settings)
-        algorithm = make(env, NETWORKS["compact"], **{level: learner_settings})
+        settings, env = tiny_settings(batch_size=16, **settings), small_env(8)
+        algorithm = make(env, NETWORKS["compact"], **{level: settings})
         learner = algorithm.learners["meta" if level == "meta" else next(iter(algorithm.learners))]
-        for batch in collect(algorithm, env, 10, batches=3):
+        for batch in played(make):
             learner.store(batch)
-            if len(learner.buffer):
-                metrics = learner.update(learner.sample())
+        metrics = learner.update(learner.sample())
         assert metrics["trained_steps"] > 0 and all(torch.isfinite(value) for value in metrics.values())
         sample = learner.sample()
-        if settings in STARTS:
-            assert sample["is_init"][:, 0].all()
-        assert ("priority_weight" in sample) == ("priority_exponent" in settings)
+        assert sample["is_init"][:, 0].all() if settings.sampling in FROM_STARTS else len(sample) == 16
+        assert ("priority_weight" in sample) == (settings.priority_exponent is not None)
 
 
 STATES = {

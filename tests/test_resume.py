@@ -30,7 +30,6 @@ TRAININGS = {
         options={"sub_hindsight": True, "meta_hindsight": True, "meta_input_time": "after_last_observation"},
     ),
     "v3": partial(make_training, name="v3"),
-    "drqn-r2d2": partial(make_training, name="drqn", learner={"stored_state": True, "priority_exponent": 0.9}),
     "v1-r2d2": partial(
         make_training, name="v1", learner={"stored_state": True, "priority_exponent": 0.9, "slice_len": 2}
     ),

@@ -18,7 +18,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
     r"""Slices that start at a step with probability :math:`p^\alpha / \sum p^\alpha`, where p is that step's priority.
 
     TorchRL's ``PrioritizedSliceSampler`` joins episodes, and the newest steps to the oldest, once a storage [time,
-    environment] is full, takes 0.4 s after every write at 200,000 steps, and has a state that only pickle can save; so
+    environment] is full, takes 0.3 s after every write at 200,000 steps, and has a state that only pickle can save; so
     its ``PrioritizedSampler`` draws the starts alone here, among those whose slice is complete: long enough, or ended
     by its episode. A new start has the largest priority there ever was, at least 1.
 
@@ -37,17 +37,18 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
 
     Examples:
         >>> from tensordict import TensorDict
+        >>> _ = torch.manual_seed(0)
         >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
         >>> sampler = PrioritizedSequenceSampler(10, slice_len=2, traj_key="episode")
-        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=8)
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=40)
         >>> steps = TensorDict(episode=torch.zeros(4, dtype=torch.int64), step=torch.arange(4), batch_size=4)
         >>> steps["next", "done"] = torch.zeros(4, 1, dtype=torch.bool)
         >>> _ = buffer.extend(steps)
-        >>> sorted(set(buffer.sample(100).reshape(50, 2)["step"][:, 0].tolist()))
+        >>> buffer.sample().reshape(20, 2)["step"][:, 0].unique().tolist()
         [0, 1, 2]
-        >>> buffer.update_priority(torch.tensor([[0], [1], [2]]), torch.tensor([0.0, 1.0, 0.0]))
-        >>> buffer.sample().reshape(4, 2)["step"][:, 0].tolist()
-        [1, 1, 1, 1]
+        >>> buffer.update_priority(torch.tensor([[0], [1], [2]]), torch.tensor([0.0, 100.0, 0.0]))
+        >>> buffer.sample().reshape(20, 2)["step"][:, 0].unique().tolist()
+        [1]
     """
 
     _rng: torch.Generator | None

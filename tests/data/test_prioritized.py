@@ -93,7 +93,7 @@ def starts_of(sample):
 
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 class TestSlices:
-    @pytest.mark.parametrize(("num_envs", "length"), [(1, 7), (3, 4), (3, 13), (2, 2)])
+    @pytest.mark.parametrize(("num_envs", "length"), [(1, 7), (3, 4), (2, 13)])
     @pytest.mark.parametrize("slice_len", [1, 4, 11])
     def test_each_is_complete_and_never_goes_over_an_end_or_the_rings_seam(self, sampling, num_envs, length, slice_len):
         torch.manual_seed(0)
@@ -232,7 +232,7 @@ class TestState:
     @pytest.mark.parametrize("sampling", SAMPLINGS)
     @pytest.mark.parametrize("batches", [3, 11], ids=["before", "after"])
     def test_a_copy_draws_and_learns_alike(self, sampling, batches, tmp_path):
-        """Through a file, into a memory with another past; then hundreds of draws, writes and new priorities."""
+        """Through a file, into a memory with another past; then many draws, writes and new priorities."""
         torch.manual_seed(0)
         first, second = World(sampling), World(sampling, seed=1)
         for _ in range(5):
@@ -243,19 +243,19 @@ class TestState:
             first.buffer.update_priority(first.sample()["index"][:, 0], 3 * torch.rand(64))
         Checkpoint().register("memory", first.buffer, adapter=SafetensorsAdapter()).save(tmp_path / "saved")
         Checkpoint().register("memory", second.buffer, adapter=SafetensorsAdapter()).load(tmp_path / "saved")
-        steps = [first.take(4) for _ in range(12)]
+        steps = [first.take(5) for _ in range(8)]
         drawn = []
         for world in (first, second):
             torch.manual_seed(5)
             drawn.append([])
             for batch in steps:
-                for _ in range(20):
+                for _ in range(6):
                     sample = world.sample()
                     drawn[-1].append(sample)
                     world.buffer.update_priority(sample["index"][:, 0], torch.rand(64) / (1 + sample["time"][:, 0]))
                 world.buffer.extend(batch.clone())
-        for one, other in zip(*drawn, strict=True):
-            assert (one == other).all()
+        first, second = (torch.stack(samples) for samples in drawn)
+        assert len(first) == 48 and (first == second).all()
 
     def test_an_empty_one(self):
         first, second = World("steps"), World("steps")
