@@ -74,6 +74,7 @@ class Schema:
     seed: int = MISSING
     device: str = MISSING
     threads: int = MISSING
+    precision: str = MISSING
     total_frames: int = MISSING
     steps_per_batch: int = MISSING
     log_frames: int = MISSING

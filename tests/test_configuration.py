@@ -133,6 +133,19 @@ class TestCheckTargets:
         check(settings)
 
 
+@pytest.mark.parametrize("name", ["drqn", "v1", "v2", "v3"])
+def test_one_precision_for_all_learners(name):
+    small = ["env.num_envs=4", "network.hidden_size=8", "network.widths=[8]"]
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = compose("config", overrides=[f"algo={name}", "precision=fp32", *small])
+        wrong = compose("config", overrides=[f"algo={name}", "precision=fp16", *small])
+    _, algorithm = build_algorithm(config)
+    assert {learner.settings.precision for learner in algorithm.learners.values()} == {"fp32"}
+    with pytest.raises(InstantiationException) as raised:
+        build_algorithm(wrong)
+    assert "precision must be 'auto', 'fp32' or 'bf16', got 'fp16'" in explain(raised.value)
+
+
 VARIANTS = sorted(path.stem for path in (Path(CONF) / "variant").glob("*.yaml"))
 
 
