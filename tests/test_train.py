@@ -495,7 +495,7 @@ def poison_updates():
     def poisoned_sample(self):
         drawn = sample(self)
         if self.frames >= 1280:
-            self._parameters[0].data[0] = float("nan")
+            next(self.network.parameters()).data[0] = float("nan")
         return drawn
 
     Learner.sample = poisoned_sample
