@@ -63,7 +63,8 @@ def test_drqn_learns_what_takes_memory():
 
 
 @pytest.mark.slow
-def test_v3_solves_a_small_room():
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_v3_solves_a_small_room(precision):
     """In two thirds of v2's frames; with view 3 it has to remember what it passed."""
     torch.manual_seed(0)
     env = small_env(32, **TASK)
@@ -76,6 +77,7 @@ def test_v3_solves_a_small_room():
         tau=0.02,
         max_grad_norm=10.0,
         sampling="episode_starts",
+        precision=precision,
     )
     algorithm = make_v3(
         env,
