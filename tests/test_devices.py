@@ -266,19 +266,12 @@ class TestEverythingIsOnOneDevice:
         parts = {"exploration": ladder} if name in FLAT else {"meta_exploration": ladder}
         (real, real_env), (algorithm, _) = make(name), make(name, env, architecture=network, **parts)
         root = real.transform(real_env).reset().to("meta")
-        carried = algorithm.policy.make_tensordict_primer() if name in FLAT or name == "v3" else None
-        for spec in [carried] if carried is not None else algorithm.make_transforms():
-            for key, each in getattr(spec, "primers", {}).items():
-                root[key] = each.zero((8,)).to("meta")
         with set_exploration_type(ExplorationType.RANDOM):
             assert self.devices(algorithm.policy(root)) == {"meta"}
         batch = collect(real, real_env, 10)[0]
         for level, learner in algorithm.learners.items():
             real.learners[level].store(batch)
-            sample = real.learners[level].sample()
-            if "sub_hidden" in sample:  # of this network's size
-                sample["sub_hidden"], sample["next", "sub_hidden"] = torch.zeros(2, *sample.shape, 8)
-            result = learner.loss(sample.to("meta"))
+            result = learner.loss(real.learners[level].sample().to("meta"))
             result["loss"].backward()
             assert self.devices(result) == {"meta"}
             norm = learner._watch_gradients(result["loss"])

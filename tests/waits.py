@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import traceback
+import sys
 
 import torch
 from torch.overrides import TorchFunctionMode
@@ -51,8 +51,11 @@ class HostWaits(TorchDispatchMode):
         return function(*args, **(kwargs or {}))
 
     def note(self, name: str) -> None:
-        frames = [frame for frame in traceback.extract_stack() if self.package in frame.filename]
-        place = f"{frames[-1].filename.rpartition(self.package + '/')[2]}:{frames[-1].name}" if frames else "elsewhere"
+        frame, place = sys._getframe(), "elsewhere"
+        while frame is not None and place == "elsewhere":
+            if f"/{self.package}/" in frame.f_code.co_filename:
+                place = f"{frame.f_code.co_filename.rpartition(self.package + '/')[2]}:{frame.f_code.co_name}"
+            frame = frame.f_back
         self.found.append(f"{name} {place}")
 
 
