@@ -56,10 +56,9 @@ class EpisodeTracker:
 
     def finished(self, batch: TensorDictBase) -> TensorDictBase:
         """Takes a collected batch ``[N, T]``; returns the episodes ``[M]`` that ended in it."""
-        ended = []
-        for after in batch.get("next").unbind(1):
-            ended.append(self.add(after)[after.get(keys.DONE).squeeze(-1)])
-        return torch.cat(ended, 0)
+        after = batch.get("next").transpose(0, 1)  # [T, N]
+        sums: TensorDictBase = torch.stack([self.add(step) for step in after.unbind(0)], 0)  # type: ignore[assignment]
+        return sums[after.get(keys.DONE).squeeze(-1)]
 
     def state_dict(self) -> dict[str, TensorDictBase | None]:
         """Sums of the episodes in progress."""

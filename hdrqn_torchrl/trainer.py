@@ -262,16 +262,18 @@ def check_finite(batch: TensorDictBase, frames: int) -> None:
     Raises:
         NonFiniteError: naming the place and the entry that came first; others follow from it.
     """
+    floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
+    if torch.stack([torch.isfinite(value).all() for value in floats.values()]).all():
+        return
     found = []
-    for key, value in batch.items(True, True):
-        if value.is_floating_point() and not torch.isfinite(value).all():
+    for key, value in floats.items():
+        if not torch.isfinite(value).all():
             wrong = ~torch.isfinite(value).reshape(*batch.shape, -1).all(-1)
             time, environment = wrong.t().nonzero()[0].tolist()
             name = ".".join(key) if isinstance(key, tuple) else key
             found.append((time, *(cause not in name for cause in (keys.OBSERVATION, keys.REWARD)), name, environment))
-    if found:
-        *_, name, environment = min(found)
-        raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")
+    *_, name, environment = min(found)
+    raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")
 
 
 class _Window:

@@ -67,9 +67,10 @@ def test_drqn_learns_what_takes_memory():
     "sequences",
     [
         {"sampling": "episode_starts", "slice_len": 16, "batch_size": 16},
+        {"sampling": "episode_starts", "slice_len": 16, "batch_size": 16, "precision": "bf16"},
         {"sampling": "steps", "slice_len": 8, "stored_state": True, "burn_in": 0.25, "priority_exponent": 0.9},
     ],
-    ids=["exact states", "R2D2"],
+    ids=["exact states", "bf16", "R2D2"],
 )
 def test_v3_solves_a_small_room(sequences):
     """In two thirds of v2's frames; with view 3 it has to remember what it passed."""

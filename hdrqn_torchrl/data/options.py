@@ -115,7 +115,7 @@ class OptionExtractor:
 
     def _pair(self, batch: TensorDictBase, starts: TensorDictBase, started: Tensor, ended: Tensor) -> TensorDictBase:
         environment, end_time = ended.nonzero(as_tuple=True)
-        options = starts[started]
+        options = starts[started.nonzero(as_tuple=True)]  # and not by mask: a GPU would count anew for every entry
         after = batch.get("next")[environment, end_time]
         if self.at_end is not None:
             after = self.at_end(after)
@@ -131,8 +131,8 @@ class OptionExtractor:
         ends = torch.where(options.get(("next", keys.DONE)).squeeze(-1), rows, -1)
         last_end = rows.new_full((num_envs,), -1).scatter_reduce(0, environment, ends, "amax")
         complete = rows <= last_end[environment]
-        self._held = options[~complete]
-        released = options[complete].exclude("environment")
+        self._held = options[(~complete).nonzero().squeeze(-1)]
+        released = options[complete.nonzero().squeeze(-1)].exclude("environment")
         if self.history is not None:
             self._look_back(released)
         return released if len(released) else None

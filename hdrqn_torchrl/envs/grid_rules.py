@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.cells import FIRST_GOAL, FLOOR, OBSTACLE, WALL
 
 LAYOUTS: dict[str, tuple[str, ...]] = {
@@ -236,14 +237,20 @@ class GridRules:
     ) -> Tensor:
         hit = met.clone()
         hit[:, self.num_obstacles :] = False
+        if not on_host(hit):
+            landing = self._free_cell(torch.cat([agent.unsqueeze(-1), objects], -1), generator)
+            return torch.where(hit, landing.unsqueeze(-1), objects)
         worlds = hit.any(-1).nonzero().squeeze(-1)
         if worlds.numel():
-            taken = torch.cat([agent[worlds, None], objects[worlds]], -1)
-            order = torch.rand((len(worlds), self.nowhere + 1), generator=generator, device=agent.device)
-            order[:, :-1].masked_fill_(self.is_wall, -1.0)
-            order.scatter_(1, taken, -1.0)[:, -1] = -1.0
-            objects[hit] = order.argmax(-1)
+            objects[hit] = self._free_cell(torch.cat([agent[worlds, None], objects[worlds]], -1), generator)
         return objects
+
+    def _free_cell(self, taken: Tensor, generator: torch.Generator | None) -> Tensor:
+        """A random free cell of each world ``[M]``, none of those ``taken`` ``[M, K]``."""
+        order = torch.rand((len(taken), self.nowhere + 1), generator=generator, device=taken.device)
+        order[:, :-1].masked_fill_(self.is_wall, -1.0)
+        order.scatter_(1, taken, -1.0)[:, -1] = -1.0
+        return order.argmax(-1)
 
     def observe(self, state: GridState) -> Tensor:
         """The window around each agent, ``[N, view, view]`` uint8 cell codes (:mod:`~hdrqn_torchrl.envs.cells`)."""

@@ -7,11 +7,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid_rules import ACTIONS, GridRules, GridState, StepEvents
 
 
@@ -143,10 +145,7 @@ class MultiGoalGridEnv(EnvBase):
             self.state = self.rules.sample(self.num_envs, self._generator)
             self.steps = torch.zeros_like(self.steps)
         else:
-            rows = mask.view(self.num_envs).nonzero().squeeze(-1)
-            fresh = self.rules.sample(len(rows), self._generator)
-            self.state = GridState(*(old.index_copy(0, rows, new) for old, new in zip(self.state, fresh, strict=True)))
-            self.steps = self.steps.index_fill(0, rows, 0)
+            self._renew(mask.view(self.num_envs))
         flag = torch.zeros((self.num_envs, 1), dtype=torch.bool, device=self.device)
         return TensorDict(
             {
@@ -161,6 +160,18 @@ class MultiGoalGridEnv(EnvBase):
             batch_size=self.batch_size,
             device=self.device,
         )
+
+    def _renew(self, ended: Tensor) -> None:
+        """New worlds where ``ended`` ``[N]``. A GPU draws them for all rather than wait for their number."""
+        self.steps = self.steps.masked_fill(ended, 0)
+        if on_host(ended):
+            rows = ended.nonzero().squeeze(-1)
+            fresh = self.rules.sample(len(rows), self._generator)
+            self.state = GridState(*(old.index_copy(0, rows, new) for old, new in zip(self.state, fresh, strict=True)))
+            return
+        fresh = self.rules.sample(self.num_envs, self._generator)
+        kept = zip(self.state, fresh, strict=True)
+        self.state = GridState(*(torch.where(expand_as_right(ended, old), new, old) for old, new in kept))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self.state, events = self.rules.step(self.state, tensordict.get(keys.ACTION), self._generator)

@@ -36,19 +36,18 @@ class CellsToImage(nn.Module):
         torch.Size([2, 3, 44, 44])
     """
 
-    _pixel_cells: Tensor
+    _cells: Tensor
     _colours: Tensor
 
     def __init__(self, view: int, num_codes: int, size: int = 44) -> None:
         super().__init__()
-        nearest = nearest_cell(size, view)
-        self.register_buffer("_pixel_cells", (nearest[:, None] * view + nearest[None, :]).flatten(), persistent=False)
+        self.register_buffer("_cells", nearest_cell(size, view), persistent=False)  # of each row, of each column
         self.register_buffer("_colours", palette(num_codes).float() / 255, persistent=False)
-        self.size = size
 
     def forward(self, cells: Tensor) -> Tensor:
-        pixels = cells.flatten(-2).long()[..., self._pixel_cells]
-        return self._colours[pixels].movedim(-1, -2).unflatten(-1, (self.size, self.size))
+        colours = self._colours.to(autocast_dtype(self._colours))
+        small = embedding(cells.int(), colours)  # [*, view, view, 3]
+        return small.index_select(-2, self._cells).index_select(-3, self._cells).movedim(-1, -3)
 
 
 class ConvFeatures(Features):

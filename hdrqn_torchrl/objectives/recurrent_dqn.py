@@ -17,6 +17,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.modules import ObservationPredictor
 from hdrqn_torchrl.objectives.prediction import prediction_loss
 from hdrqn_torchrl.objectives.targets import (
@@ -274,7 +275,7 @@ class RecurrentDQNLoss(LossModule):
         """The T + 1 inputs of each sequence: what was seen at each step, then what followed the last valid one."""
         k = self.tensor_keys
         mask_keys = [] if k.action_mask is None else [k.action_mask]
-        padded = not bool(valid.all())
+        padded = k.mask in tensordict.keys(True) and not (on_host(valid) and bool(valid.all()))
         nothing = torch.zeros_like(valid[:, :1])
         own, reached = torch.cat([valid, nothing], 1), torch.cat([nothing, valid], 1)  # seen at, or after, a valid step
         inputs = TensorDict({}, (tensordict.shape[0], tensordict.shape[1] + 1), device=tensordict.device)
