@@ -74,7 +74,7 @@ class Schema:
     seed: int = MISSING
     device: str = MISSING
     threads: int = MISSING
-    precision: str = MISSING
+    precision: str = "fp32"  # of runs that are older than this setting
     total_frames: int = MISSING
     steps_per_batch: int = MISSING
     log_frames: int = MISSING

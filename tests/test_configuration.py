@@ -288,6 +288,11 @@ class TestReadConfig:
         assert config == settings
         assert OmegaConf.is_interpolation(config.algo.sub, "learning_rate_frames")  # it follows total_frames
 
+    def test_a_run_older_than_the_setting_was_in_single_precision(self, run):
+        path = run / "config.yaml"
+        path.write_text("".join(line for line in path.read_text().splitlines(True) if "precision" not in line))
+        assert read_config(run).precision == "fp32"
+
     @pytest.mark.parametrize(
         "text",
         ["", "text", "[1, 2]", "3", "env: [", "\x00", "seed: 1", "env: &a [*a]", "{", "a: 1\na: 2\n: :", "- env: 1"],
