@@ -1,0 +1,80 @@
+"""What a builder returns, and what several of them share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, TransformedEnv
+
+from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
+from hdrqn_torchrl.objectives import RecurrentDQNLoss
+
+Controller = SubController | MetaController | AllSubgoalsPolicy
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """A policy, its learners (one per level, by name) and the transforms its environment needs."""
+
+    policy: TensorDictModuleBase
+    learners: dict[str, Learner]
+    explorations: dict[str, EpsilonGreedy]
+    make_transforms: Callable[[], Compose]
+
+    def transform(self, env: EnvBase) -> TransformedEnv:
+        """The environment as this algorithm sees it."""
+        return TransformedEnv(env, self.make_transforms())
+
+
+def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:
+    """The recurrent states that are stored with the steps: all or none.
+
+    Raises:
+        ValueError: if ``settings.stored_state`` is asked of a network without memory.
+    """
+    if settings.stored_state and not network.state_keys:
+        raise ValueError("stored_state must be False without recurrence, got True; such a network has no state.")
+    return network.state_keys if settings.stored_state else []
+
+
+def make_recurrent_loss(
+    network: Controller,
+    settings: LearnerSettings,
+    *,
+    gamma: float = 0.99,
+    loss_keys: Mapping[str, NestedKey | None] | None = None,
+    prediction_weight: float = 0.1,
+) -> RecurrentDQNLoss:
+    """The loss of one level, as its settings have it.
+
+    Args:
+        network: the controller that is trained.
+        settings: how it learns.
+        gamma: discount of one environment step.
+        loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
+        prediction_weight: of the error of the network's predictor, if it has one.
+
+    Raises:
+        ValueError: if ``settings.stored_state`` is asked of a network without memory.
+    """
+    loss = RecurrentDQNLoss(
+        network,
+        gamma=gamma,
+        burn_in=settings.burn_in,
+        train_exact_states=settings.train_exact_states,
+        loss_function=settings.loss_function,
+        double=settings.double,
+        max_target=settings.max_target,
+        trace_decay=settings.trace_decay,
+        n_step=settings.n_step,
+        state_keys=stored_states(network, settings),
+        predictor=network.network.predictor,
+        prediction_weight=prediction_weight,
+    )
+    loss.set_keys(**(loss_keys or {}))
+    return loss

@@ -1,0 +1,70 @@
+"""DQN and DRQN: one level, which learns from the task's total reward."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, InitTracker
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms.base import Algorithm, make_recurrent_loss, stored_states
+from hdrqn_torchrl.data import StepSelector
+from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, SubController
+
+
+def make_drqn(
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    learner: LearnerSettings = LearnerSettings(),  # noqa: B008 (frozen)
+    exploration: EpsilonGreedy | None = None,
+    gamma: float = 0.99,
+    recurrent: bool = True,
+    prediction_steps: int = 0,
+    prediction_weight: float = 0.1,
+) -> Algorithm:
+    """Flat recurrent Q-learning (Hausknecht and Stone, 2015) on the task's total reward.
+
+    Args:
+        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        architecture: networks.
+        learner: how it learns.
+        exploration: its schedule.
+        gamma: discount of one step.
+        recurrent: ``False`` gives DQN.
+        prediction_steps, prediction_weight: as in :func:`make_v3`.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> list(make_drqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
+        ['flat']
+    """
+    exploration = exploration or EpsilonGreedy()
+    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
+    network = architecture.q_network(
+        observation, num_actions=num_actions, recurrent=recurrent, prediction_steps=prediction_steps
+    )
+    policy = SubController(network, exploration, subgoal_key=None, init_key=keys.IS_INIT).to(env.device)
+    flat = Learner(
+        policy,
+        learner,
+        extract=StepSelector(
+            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
+            next_keys=[keys.OBSERVATION, keys.REWARD],
+        ),
+        loss=make_recurrent_loss(policy, learner, gamma=gamma, prediction_weight=prediction_weight),
+        num_envs=env.batch_size[0],
+    )
+    return Algorithm(
+        policy=policy,
+        learners={"flat": flat},
+        explorations={"flat": exploration},
+        make_transforms=lambda: Compose(InitTracker(), policy.make_tensordict_primer()),
+    )
+
+
+make_dqn = partial(make_drqn, recurrent=False)
+"""Flat Q-learning without memory (Mnih et al., 2015); see :func:`make_drqn`."""

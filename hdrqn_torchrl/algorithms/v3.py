@@ -1,0 +1,176 @@
+"""hDRQNv3: one memory for the whole episode, with heads for both levels."""
+
+from __future__ import annotations
+
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, InitTracker
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms.base import Algorithm, stored_states
+from hdrqn_torchrl.data import FROM_STARTS, StepSelector
+from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.modules import (
+    AllSubgoalsNetwork,
+    AllSubgoalsPolicy,
+    Architecture,
+    EpsilonGreedy,
+    RepeatingEpsilonGreedy,
+    observation_predictor,
+)
+from hdrqn_torchrl.objectives import AllSubgoalsLoss
+from hdrqn_torchrl.transforms import SubgoalTransform
+
+V3_LEARNER = LearnerSettings(
+    slice_len=50,
+    capacity=200_000,
+    frames_per_update=20,
+    warmup_frames=10_000,
+    learning_rate=6e-4,
+    tau=0.005,
+    max_grad_norm=10.0,
+    sampling="episode_starts",
+)
+"""Defaults of :func:`make_v3`, for episodes of 50 steps."""
+
+
+def make_v3(
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    learner: LearnerSettings = V3_LEARNER,
+    sub_exploration: EpsilonGreedy | None = None,
+    meta_exploration: EpsilonGreedy | None = None,
+    memory_size: int = 128,
+    head_size: int = 128,
+    joint: bool = True,
+    meta_learning_rate: float | None = None,
+    sub_gamma: float = 0.95,
+    meta_gamma: float = 0.97,
+    trace_decay: float = 0.8,
+    all_subgoals: bool = True,
+    intra_option: bool = True,
+    wrong_subgoal_reward: float = -0.5,
+    hazard_reward: float = -1.0,
+    max_option_steps: int | None = None,
+    max_meta_target: float | None = None,
+    prediction_steps: int = 4,
+    prediction_weight: float = 0.1,
+) -> Algorithm:
+    """hDRQNv3, this project's own agent: one memory for the whole episode, all subgoals learn from every step.
+
+    Args:
+        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        architecture: where the features come from.
+        learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
+            should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
+        sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
+        memory_size: H, size of the LSTM.
+        head_size: units of the heads' hidden layers.
+        joint: whether the meta level trains the memory, too; ``False``: it reads the memory only, and its head has an
+            optimiser of its own.
+        meta_learning_rate: of that optimiser, following the same schedule; ``None``: ``learner.learning_rate``.
+        sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, wrong_subgoal_reward, hazard_reward,
+            max_meta_target, prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        max_option_steps: step limit of an option.
+        prediction_steps: how many steps ahead, at most, the memory learns to predict what will be seen
+            (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
+
+    Raises:
+        ValueError: if ``learner.sampling`` begins in mid-episode without ``stored_state``, where the memory would
+            start empty; or if ``learner`` has targets of its own (``max_target``, ``trace_decay``, ``n_step``).
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
+        ['joint']
+    """
+    if learner.sampling not in FROM_STARTS and not learner.stored_state:
+        raise ValueError(
+            f"sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its memory "
+            "lasts a whole episode and would start empty in the middle of one; or use stored_state=True."
+        )
+    if learner.trace_decay or learner.n_step > 1:
+        raise ValueError(
+            f"learner.trace_decay and n_step must be left at 0 and 1 for v3, got {learner.trace_decay} and "
+            f"{learner.n_step}; its loss has a trace_decay of its own, an argument of v3."
+        )
+    if learner.max_target is not None:
+        raise ValueError(
+            f"max_target must be None for v3, got {learner.max_target}; its levels are bounded apart: the sub level by "
+            "the reward for reaching the subgoal, the meta level by max_meta_target."
+        )
+    if joint and meta_learning_rate is not None:
+        raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
+    meta_rate = learner.learning_rate if meta_learning_rate is None else meta_learning_rate
+    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
+    num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
+    predictor = None
+    if prediction_steps:
+        predictor = observation_predictor(observation, memory_size, num_actions, prediction_steps, width=head_size)
+    network = AllSubgoalsNetwork(
+        architecture.observation_features(observation),
+        num_actions=num_actions,
+        num_subgoals=num_subgoals,
+        hidden_size=memory_size,
+        head_size=head_size,
+        joint=joint,
+        predictor=predictor,
+    )
+    sub_exploration, meta_exploration = sub_exploration or RepeatingEpsilonGreedy(), meta_exploration or EpsilonGreedy()
+    policy = AllSubgoalsPolicy(network, sub_exploration, meta_exploration).to(env.device)
+    loss = AllSubgoalsLoss(
+        policy,
+        sub_gamma=sub_gamma,
+        meta_gamma=meta_gamma,
+        trace_decay=trace_decay,
+        wrong_subgoal_reward=wrong_subgoal_reward,
+        hazard_reward=hazard_reward,
+        double=learner.double,
+        all_subgoals=all_subgoals,
+        intra_option=intra_option,
+        max_meta_target=max_meta_target,
+        prediction_weight=prediction_weight,
+        burn_in=learner.burn_in,
+        train_exact_states=learner.train_exact_states,
+        loss_function=learner.loss_function,
+        stored_state=learner.stored_state,
+    )
+    stored = StepSelector(
+        root_keys=[
+            keys.OBSERVATION,
+            keys.PREVIOUS_ACTION,
+            keys.ACTION,
+            keys.IS_INIT,
+            keys.OPTION_INIT,
+            keys.SUBGOAL_MASK,
+            *stored_states(policy, learner),
+        ],
+        next_keys=[keys.ATTAINED, keys.HAZARD, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
+    )
+    trained = Learner(
+        policy,
+        learner,
+        extract=stored,
+        loss=loss,
+        lookahead=1,
+        num_envs=env.batch_size[0],
+        separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
+    )
+
+    def make_transforms() -> Compose:
+        subgoals = SubgoalTransform(
+            num_subgoals,
+            gamma=meta_gamma,
+            max_option_steps=max_option_steps,
+            hazard_reward=hazard_reward,
+            wrong_subgoal_reward=wrong_subgoal_reward,
+        )
+        return Compose(InitTracker(), subgoals, policy.make_tensordict_primer())
+
+    return Algorithm(
+        policy=policy,
+        learners={"joint": trained},
+        explorations={"sub": sub_exploration, "meta": meta_exploration},
+        make_transforms=make_transforms,
+    )
