@@ -15,6 +15,13 @@ def on_host(tensor: Tensor) -> bool:
     return tensor.device.type == "cpu"
 
 
+def multiplies_bfloat16(kind: str) -> bool:
+    """Whether devices of a kind (``"cpu"``, ``"cuda"``) have matrix units for bfloat16."""
+    if kind == "cpu":
+        return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
+    return kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+
+
 def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
     """What autocast makes of matrix products on a tensor's device; ``None`` outside of it."""
     kind = tensor.device.type

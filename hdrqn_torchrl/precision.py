@@ -13,6 +13,8 @@ from typing import Literal
 import torch
 from torch import nn
 
+from hdrqn_torchrl.devices import multiplies_bfloat16
+
 Precision = Literal["fp32", "bf16"]
 
 
@@ -41,13 +43,6 @@ def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) ->
             raise ValueError(f"precision must be 'fp32' or 'auto' on this device ({kind}), which lacks bf16.")
         warnings.warn("precision='bf16' is slow on a CPU without AMX; use 'auto' or 'fp32'.", stacklevel=2)
     return wanted
-
-
-def multiplies_bfloat16(kind: str) -> bool:
-    """Whether devices of a kind (``"cpu"``, ``"cuda"``) have matrix units for bfloat16."""
-    if kind == "cpu":
-        return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
-    return kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
 
 
 def gains(network: nn.Module) -> bool:

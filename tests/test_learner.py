@@ -5,6 +5,7 @@ import torch
 from helpers import build, collect, parameter_distance, small_env, tiny_settings
 from tensordict import TensorDict
 
+from hdrqn_torchrl import learner as learner_module
 from hdrqn_torchrl.algorithms import make_recurrent_loss
 from hdrqn_torchrl.finite import NonFiniteError
 from hdrqn_torchrl.learner import Learner, LearnerSettings
@@ -298,6 +299,7 @@ class TestSettings:
         [
             ("burn_in", 1.0, r"burn_in must lie in \[0, 1\), got 1.0; "),
             ("loss_function", "l1", "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
+            ("precision", "fp16", "precision must be 'auto', 'fp32' or 'bf16', got 'fp16'; "),
             ("sampling", "rows", "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),
         ],
     )
@@ -318,6 +320,7 @@ class TestSettings:
             {"max_target": 0.1},
             {"trace_decay": 0.5},
             {"n_step": 2},
+            {"precision": "bf16"},
         ],
         ids=str,
     )
@@ -492,3 +495,73 @@ class TestSeparateParts:
     def test_wrong_values(self, separate):
         with pytest.raises(ValueError, match="separate must map beginnings of parameters' names to shares > 0"):
             make_learner(separate=separate)
+
+
+class TestNumbersThatAreNoneOnAGPU:
+    """There the host looks later; until then the optimiser leaves the weights alone by itself."""
+
+    def poisoned(self):
+        learner = make_learner(max_grad_norm=1.0, learning_rate=0.1)
+        learner.guard.at_once = False
+        learner.store(make_batch())
+        learner.update(learner.sample())
+        sample = learner.sample()
+        sample["next", "reward"].fill_(float("nan"))
+        return learner, sample
+
+    def test_no_update_reaches_the_weights_from_then_on(self):
+        learner, sample = self.poisoned()
+        states = learner.optimizer.state.values()
+        before = [value.clone() for value in learner.network.parameters()]
+        moments = [value.clone() for state in states for value in state.values()]
+        for each in (sample, learner.sample()):
+            learner.update(each)
+            assert all((new == old).all() for new, old in zip(learner.network.parameters(), before, strict=True))
+            assert [value.tolist() for state in states for value in state.values()] == [v.tolist() for v in moments]
+
+    @pytest.mark.parametrize("look", ["check_finite", "state_dict", "store"])
+    def test_the_host_hears_of_it(self, look):
+        learner, sample = self.poisoned()
+        learner.update(sample)
+        learner.update(learner.sample())
+        arguments = [make_batch()] if look == "store" else []
+        with pytest.raises(NonFiniteError, match=r"^the loss became nan in update 2, frame 16$"):
+            getattr(learner, look)(*arguments)
+
+    def test_sound_updates_are_those_of_a_cpu(self):
+        learners = [make_learner(max_grad_norm=1.0, learning_rate=0.1) for _ in range(2)]
+        learners[1].guard.at_once = False
+        torch.manual_seed(1)
+        for _ in range(4):
+            sample = make_batch()
+            for learner in learners:
+                learner.update(sample.clone())
+        learners[1].check_finite()
+        params = [learner.loss.value_network_params.data for learner in learners]
+        assert parameter_distance(*params) == 0
+
+
+class TestPrecision:
+    def chosen(self, monkeypatch, choice, **settings):
+        monkeypatch.setattr(learner_module, "choose_precision", lambda wanted, _: {"auto": choice}.get(wanted, wanted))
+        return make_learner(extract=Keep(), **settings)
+
+    def test_what_auto_chose_is_kept_on_another_machine(self, monkeypatch):
+        first = self.chosen(monkeypatch, "bf16", precision="auto")
+        second = self.chosen(monkeypatch, "fp32", precision="auto")
+        assert (first.precision, second.precision) == ("bf16", "fp32")
+        second.load_state_dict(first.state_dict())
+        assert second.precision == "bf16"
+
+    def test_an_explicit_one_is_kept_in_any_case(self, monkeypatch):
+        first = self.chosen(monkeypatch, "bf16", precision="auto")
+        second = make_learner(extract=Keep(), precision="fp32")
+        second.load_state_dict(first.state_dict())
+        assert second.precision == "fp32"
+
+    def test_a_state_from_before_there_was_a_choice(self, monkeypatch):
+        state = make_learner(extract=Keep()).state_dict()
+        del state["precision"]
+        second = self.chosen(monkeypatch, "bf16", precision="auto")
+        second.load_state_dict(state)
+        assert second.precision == "fp32"

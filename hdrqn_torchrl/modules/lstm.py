@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from hdrqn_torchrl.devices import autocast_dtype, on_host
+from hdrqn_torchrl.devices import autocast_dtype, multiplies_bfloat16, on_host
 
 CLOSED = -1e4
 """Input of a gate at a gap; its sigmoid is zero in every floating-point format."""
@@ -185,11 +185,18 @@ class Gaps:
         padding = -(weight_ih.shape[1] + 1) % 8  # other widths cost oneDNN half its speed in bfloat16
         closing = weight_ih.new_zeros((4, lstm.hidden_size, 1 + padding))
         closing[:2, :, 0] = closing[3, :, 0] = CLOSED
-        flag = parts[0].new_zeros((len(self._is_gap), 1 + padding))
+        low = autocast_dtype(weight_ih)
+        flag = weight_ih.new_zeros((len(self._is_gap), 1 + padding), dtype=low)
         flag[:, 0] = self._is_gap
         inputs = torch.cat([*(part.to(flag.dtype) for part in parts), flag], -1).unflatten(0, self._gapped)
         weights = [torch.cat([weight_ih, closing.flatten(0, 1)], 1), weight_hh, bias_ih, bias_hh]
-        start = [(part * self._keep).unsqueeze(0) for part in state]
+        hidden, cell = ((part * self._keep).unsqueeze(0) for part in state)
         # has_biases, num_layers, dropout, train, bidirectional, batch_first
         settings = True, 1, 0.0, torch.is_grad_enabled(), False, False
-        return torch.lstm(inputs, start, weights, *settings)[0].flatten(0, 1)
+        if low is None:
+            return torch.lstm(inputs, (hidden, cell), weights, *settings)[0].flatten(0, 1)
+        # Autocast would lower the cell, too, and what a cell adds up in small steps would be lost.
+        with torch.autocast(inputs.device.type, enabled=False):
+            weights = [weight.to(low) for weight in weights]
+            start = hidden.to(low), cell if multiplies_bfloat16(inputs.device.type) else cell.to(low)
+            return torch.lstm(inputs, start, weights, *settings)[0].flatten(0, 1)

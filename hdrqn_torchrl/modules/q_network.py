@@ -163,7 +163,9 @@ class QNetwork(nn.Module):
         features = self._embed(observation, condition)
         if not isinstance(self.memory, nn.LSTM):
             return self.memory(features)
-        if init is not None and not (on_host(init) and not init[:, 1:].any()):
+        lower = autocast_dtype(features) is not None  # the library's own call would lower the cell, too
+        if lower or (init is not None and not (on_host(init) and not init[:, 1:].any())):
+            init = features.new_zeros(features.shape[:2], dtype=torch.bool) if init is None else init
             state = self.initial_state(len(features)) if state is None else state
             return restarting_lstm(self.memory, features, init, state)
         if state is None:

@@ -1,10 +1,22 @@
+import math
 from types import SimpleNamespace
 
 import pytest
 import torch
 from torch import nn
 
-from hdrqn_torchrl.modules.lstm import restarting_lstm
+from hdrqn_torchrl.devices import multiplies_bfloat16
+from hdrqn_torchrl.modules import lstm as lstm_module
+from hdrqn_torchrl.modules.lstm import Gaps, restarting_lstm
+
+
+def with_gaps(lstm, inputs, init, state):
+    """The other way to the same outputs."""
+    gaps = Gaps(init)
+    return gaps.remove(gaps.lstm(lstm, [gaps.insert(inputs)], state))
+
+
+both_ways = pytest.mark.parametrize("unroll", [restarting_lstm, with_gaps])
 
 
 def make_case(batch, time, restart_rate):
@@ -35,12 +47,13 @@ def cell_loop(lstm, inputs, init, state):
     return torch.stack(rows)
 
 
+@both_ways
 @pytest.mark.parametrize(
     ("batch", "time", "restart_rate"), [(3, 6, 0.3), (1, 6, 0.3), (4, 1, 0.5), (1, 1, 0.0), (3, 5, 0.0), (2, 5, 1.0)]
 )
-def test_outputs_and_all_gradients_equal_a_loop_over_cells(batch, time, restart_rate):
+def test_outputs_and_all_gradients_equal_a_loop_over_cells(batch, time, restart_rate, unroll):
     lstm, inputs, init, state = make_case(batch, time, restart_rate)
-    outputs, expected = restarting_lstm(lstm, inputs, init, state), cell_loop(lstm, inputs, init, state)
+    outputs, expected = unroll(lstm, inputs, init, state), cell_loop(lstm, inputs, init, state)
     torch.testing.assert_close(outputs, expected)
     weights = torch.randn_like(outputs)
     leaves = [inputs, *state, *lstm.parameters()]
@@ -61,20 +74,105 @@ def test_gradients_equal_finite_differences():
     assert torch.autograd.gradcheck(run, (inputs, *state, *lstm.parameters()))
 
 
-def test_frozen_inputs_and_weights_need_no_gradient():
+@both_ways
+def test_frozen_inputs_and_weights_need_no_gradient(unroll):
     lstm, inputs, init, state = make_case(2, 4, 0.3)
     lstm.requires_grad_(False)
-    outputs = restarting_lstm(lstm, inputs.detach(), init, tuple(part.detach() for part in state))
+    outputs = unroll(lstm, inputs.detach(), init, tuple(part.detach() for part in state))
     assert not outputs.requires_grad
     lstm.requires_grad_(True)
-    outputs = restarting_lstm(lstm, inputs.detach(), init, tuple(part.detach() for part in state))
+    outputs = unroll(lstm, inputs.detach(), init, tuple(part.detach() for part in state))
     outputs.sum().backward()
     assert lstm.weight_hh_l0.grad.abs().sum() > 0
 
 
-def test_the_state_before_a_restart_is_forgotten_and_others_keep_theirs():
+@both_ways
+def test_the_state_before_a_restart_is_forgotten_and_others_keep_theirs(unroll):
     lstm, inputs, _, (hidden, cell) = make_case(2, 3, 0.0)
     init = torch.tensor([[True, False, False], [False, False, False]])
-    outputs = restarting_lstm(lstm, inputs, init, (hidden, cell))
-    moved = restarting_lstm(lstm, inputs, init, (hidden + 1.0, cell))
+    outputs = unroll(lstm, inputs, init, (hidden, cell))
+    moved = unroll(lstm, inputs, init, (hidden + 1.0, cell))
     assert (outputs[0] == moved[0]).all() and (outputs[1] != moved[1]).any()
+
+
+class TestGaps:
+    init = torch.tensor([[True, False, True, True], [False, False, False, False], [False, True, False, False]])
+
+    def test_one_before_each_restart_but_at_the_first_step(self):
+        """Two in the first row, none in the second, one in the third; then all rows have the same length."""
+        gaps, numbers = Gaps(self.init), torch.arange(12).view(3, 4)
+        rows = gaps.insert(numbers).view(6, 3)
+        is_gap = gaps._is_gap.view(6, 3)
+        assert is_gap.t().tolist() == [
+            [False, False, True, False, True, False],
+            [False, False, False, False, True, True],
+            [False, True, False, False, False, True],
+        ]
+        assert [column[~gap].tolist() for column, gap in zip(rows.t(), is_gap.t(), strict=True)] == numbers.tolist()
+        assert (gaps.remove(gaps.insert(numbers)) == numbers).all()
+
+    @pytest.mark.parametrize("kind", [torch.float32, torch.float64, torch.bfloat16])
+    def test_behind_a_gap_the_state_is_exactly_zero(self, kind):
+        """However large it was: outputs do not depend on what stands before a restart, nor do gradients reach it."""
+        torch.manual_seed(0)
+        lstm, inputs = nn.LSTM(3, 4).to(kind), torch.randn(3, 4, 3, dtype=kind)
+        state = tuple(torch.full((3, 4), 50.0, dtype=kind) for _ in range(2))
+        other = inputs.clone()
+        other[0, 1] += 5.0
+        inputs.requires_grad_()
+        outputs, moved = with_gaps(lstm, inputs, self.init, state), with_gaps(lstm, other, self.init, state)
+        assert (outputs[0, 2:] == moved[0, 2:]).all() and (outputs[0, 1] != moved[0, 1]).any()
+        (gradient,) = torch.autograd.grad(outputs[0, 2:].sum(), inputs)
+        assert (gradient[0, :2] == 0).all() and (gradient[0, 2:] != 0).all() and (gradient[1:] == 0).all()
+
+    def test_parts_stand_side_by_side(self):
+        lstm, inputs, init, state = make_case(3, 6, 0.3)
+        gaps = Gaps(init)
+        parts = gaps.insert(inputs[..., :2]), gaps.insert(inputs[..., 2:])
+        found = gaps.lstm(lstm, list(parts), state)
+        assert (found == gaps.lstm(lstm, [gaps.insert(inputs)], state)).all()
+
+    def test_without_gradient_the_outputs_are_the_same(self):
+        lstm, inputs, init, state = make_case(3, 6, 0.3)
+        with torch.no_grad():
+            outputs = with_gaps(lstm, inputs, init, state)
+        torch.testing.assert_close(outputs, with_gaps(lstm, inputs, init, state).detach())
+
+
+class TestAutocast:
+    """Under autocast outputs and gradients are those of float32 but for rounding, on either way."""
+
+    @pytest.mark.parametrize("on_gpu", [False, True])
+    def test_outputs_and_gradients(self, on_gpu, monkeypatch):
+        lstm, inputs, init, state = make_case(4, 30, 0.1)
+        lstm, inputs, state = lstm.float(), inputs.float().detach(), [part.float().detach() for part in state]
+        leaves = [inputs.requires_grad_(), *(part.requires_grad_() for part in state), *lstm.parameters()]
+        expected = restarting_lstm(lstm, inputs, init, tuple(state))
+        monkeypatch.setattr(lstm_module, "on_host", lambda tensor: not on_gpu)
+        with torch.autocast("cpu", torch.bfloat16):
+            outputs = restarting_lstm(lstm, inputs, init, tuple(state))
+        assert outputs.dtype == (torch.float32 if on_gpu else torch.bfloat16)
+        assert (outputs != expected).any()
+        assert relative_error(outputs, expected) < 0.01
+        weights = torch.randn_like(expected)
+        wanted = torch.autograd.grad((expected * weights).sum(), leaves)
+        for gradient, want in zip(torch.autograd.grad((outputs.float() * weights).sum(), leaves), wanted, strict=True):
+            assert gradient.dtype == torch.float32 and relative_error(gradient, want) < 0.02
+
+    @pytest.mark.parametrize("on_gpu", [False, True])
+    def test_the_cell_stays_precise(self, on_gpu, monkeypatch):
+        """Where a thousandth is added to 1 in each of 200 steps, it would stand still in bfloat16."""
+        if not on_gpu and not multiplies_bfloat16("cpu"):
+            pytest.skip("without AMX the cell is lowered, too")
+        monkeypatch.setattr(lstm_module, "on_host", lambda tensor: not on_gpu)
+        lstm = nn.LSTM(1, 1, batch_first=True).requires_grad_(False)
+        lstm.weight_ih_l0.zero_(), lstm.weight_hh_l0.zero_(), lstm.bias_hh_l0.zero_()
+        lstm.bias_ih_l0.copy_(torch.tensor([50.0, 50.0, 0.001, 50.0]))  # writes 0.001, forgets nothing, shows all
+        init, start = torch.zeros(1, 200, dtype=torch.bool), (torch.zeros(1, 1), torch.ones(1, 1))
+        with torch.autocast("cpu", torch.bfloat16):
+            outputs = restarting_lstm(lstm, torch.zeros(1, 200, 1), init, start)
+        assert outputs[0, -1].item() == pytest.approx(math.tanh(1.2), abs=2e-3)  # tanh(1) is 0.07 less
+
+
+def relative_error(found, expected):
+    return ((found.float() - expected).norm() / expected.norm()).item()
