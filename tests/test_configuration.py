@@ -158,11 +158,14 @@ class TestVariants:
             plain = compose("config", overrides=[f"algo={name.split('_')[0]}", *small])
         check(config)
         build_algorithm(config)
-        assert (config.algo != plain.algo) == ("_" in name)
+        assert ((config.algo, config.env) != (plain.algo, plain.env)) == ("_" in name)
 
-    def test_the_ablation_is_over_all_of_them(self):
-        sweep = OmegaConf.load(Path(CONF) / "experiment" / "ablation.yaml").hydra.sweeper.params
-        assert sorted(sweep.variant.split(",")) == VARIANTS
+    def test_each_stands_in_an_experiment(self):
+        used = set()
+        for name in ("ablation", "authors_choices"):
+            sweep = OmegaConf.load(Path(CONF) / "experiment" / f"{name}.yaml").hydra.sweeper.params
+            used |= set(sweep.variant.split(","))
+        assert sorted(used) == VARIANTS
 
 
 @pytest.mark.parametrize(

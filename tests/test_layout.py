@@ -10,7 +10,7 @@ import hdrqn_torchrl
 ORDER = (
     "keys", "devices", "envs", "transforms", "modules", "objectives", "data", "collectors", "precision", "finite",
     "learner", "algorithms", "evaluation", "serialization", "checkpoint", "interruption", "logging", "results",
-    "estimates", "grouping", "plotting", "rendering", "comparison", "trainer", "run_folder",
+    "estimates", "claims", "grouping", "plotting", "rendering", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

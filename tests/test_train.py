@@ -43,7 +43,7 @@ TINY_HDRQN = [f"algo.{level}.{setting}" for level in ("sub", "meta") for setting
 
 
 def choices(group):
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
+    return sorted(str(path.relative_to(CONF / group).with_suffix("")) for path in (CONF / group).rglob("*.yaml"))
 
 
 def configure(*overrides):

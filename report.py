@@ -1,0 +1,263 @@
+"""Writes the results of the paper's studies: figures, tables and what agrees with its claims, from run folders.
+
+    python train.py -m experiment=gridworld sweep=parallel resume=auto output_root=outputs/studies
+    python report.py runs=outputs/studies out=docs/results.md
+
+runs      folders, glob patterns or archives (.tar.xz) that an earlier report kept, several in brackets; a run belongs
+          to a study if it has the settings of one of its jobs, wherever it lies
+out       text to write; its figures and tables go to a folder of the same name. What stands in it outside of the
+          marked parts is left as it is
+size      small (default) or paper: which of a study's two sizes
+studies   only these: studies=gridworld,views
+keep      archive (.tar.xz) to put the runs' settings and measurements into; weights are not kept
+"""
+
+from __future__ import annotations
+
+import re
+import tarfile
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import MISSING
+
+from configuration import SettingsError, command_line
+from hdrqn_torchrl.claims import Results
+from hdrqn_torchrl.comparison import GREEDY, PAPER, plot_curves
+from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
+from hdrqn_torchrl.grouping import Entry, rows_of, value_of
+from hdrqn_torchrl.results import final_value
+from plot import YAML_LOADER, as_list, common_references, read_entries
+from studies import STUDIES, Study, flat, is_run_of, jobs_of
+
+KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json")
+SIZES = ("small", "paper")
+QUANTITIES = ("return", "success", "in_order", "steps")
+HEADER = (
+    "| | seeds | return | 95 % interval | IQM | share of the ceiling | in order | all in order | steps | frames "
+    "| wall time | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+)
+_NAMES = [study.name for study in STUDIES]
+
+
+@dataclass
+class Settings:
+    """Arguments; the module's docstring explains them."""
+
+    runs: Any = MISSING
+    out: str = "docs/results.md"
+    size: str = "small"
+    studies: Any = None
+    keep: str | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """A run of a study."""
+
+    entry: Entry
+    settings: dict[str, Any]
+    """As :func:`studies.flat` gives them."""
+    origin: dict[str, Any]
+    """``run.json``"""
+
+
+def main(settings: Settings) -> None:
+    """Reads, matches, draws, writes."""
+    wanted = [str(name) for name in as_list(settings.studies, split=True)] or _NAMES
+    if settings.size not in SIZES:
+        raise SettingsError(f"size must be one of {', '.join(SIZES)}, got {settings.size!r}.")
+    if unknown := [name for name in wanted if name not in _NAMES]:
+        raise SettingsError(f"studies must be some of {', '.join(_NAMES)}, got {unknown[0]!r}.")
+    if Path(settings.out).suffix != ".md":
+        raise SettingsError(f"out must end in .md, got {settings.out!r}; for example out=docs/results.md.")
+    out = Path(settings.out)
+    out.with_suffix("").mkdir(parents=True, exist_ok=True)
+    text = out.read_text() if out.exists() else "# Results\n"
+    used: dict[Path, Found] = {}
+    with ExitStack() as stack:
+        runs = read_runs([str(each) for each in as_list(settings.runs)], stack)
+        everywhere = runs_of_jobs("gridworld", settings.size, runs)[0]
+        for study in STUDIES:
+            if study.name in wanted:
+                found, missing = runs_of_jobs(study.name, settings.size, runs)
+                used |= {each.entry.run.folder: each for each in found}
+                text = put(text, f"{study.name} {settings.size}", section(study, found, missing, everywhere, settings))
+                print(f"{study.name}: runs {len(found)}, missing {missing}")
+        if settings.keep:
+            keep(list(used.values()), Path(settings.keep))
+    out.write_text(text)
+
+
+def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
+    """All runs below folders and in archives; archives are unpacked for as long as ``stack`` lasts."""
+    places = []
+    for pattern in patterns:
+        if pattern.endswith(".tar.xz"):
+            unpacked = stack.enter_context(tempfile.TemporaryDirectory())
+            try:
+                with tarfile.open(pattern) as archive:
+                    archive.extractall(unpacked, filter="data")
+            except (OSError, tarfile.TarError) as error:
+                raise SettingsError(f"runs must name folders or readable archives, got {pattern}: {error}.") from error
+            pattern = unpacked
+        places.append(pattern)
+    found = []
+    for entry in read_entries(places):
+        config, origin = (entry.run.folder / name for name in ("config.yaml", "run.json"))
+        if config.exists() and origin.exists():
+            settings = flat(yaml.load(config.read_text(), YAML_LOADER))
+            found.append(Found(entry, settings, yaml.load(origin.read_text(), YAML_LOADER)))
+    return found
+
+
+def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[list[Found], int]:
+    """The run of each job of an experiment that has one, and the number of jobs that have none.
+
+    Of several runs of one job the finished one that went furthest counts.
+    """
+    found, missing = [], 0
+    for job in jobs_of(experiment if size == "small" else f"paper/{experiment}"):
+        same = [run for run in runs if is_run_of(job, run.settings)]
+        if same:
+            found.append(max(same, key=lambda run: (bool(run.entry.run.summary), run.entry.run.metrics["frames"][-1])))
+        else:
+            missing += 1
+    return found, missing
+
+
+def section(study: Study, found: list[Found], missing: int, everywhere: list[Found], settings: Settings) -> str:
+    """Figure, table and claims of a study as Markdown; writes the figure and its data."""
+    experiment = study.name if settings.size == "small" else f"paper/{study.name}"
+    lines = [f"`python train.py -m experiment={experiment}`"]
+    if missing:
+        lines[0] += f" (runs that have not been made yet: {missing} of {missing + len(found)})"
+    if not found:
+        return lines[0]
+    beside = [run for run in everywhere if value_of(run.entry, "algo") in study.beside]
+    tasks = rows_of_study(study, found, beside)
+    folder = Path(settings.out).with_suffix("")
+    name = study.name if settings.size == "small" else f"{study.name}_paper"
+    curves = [sum_up(title, groups) for title, groups in tasks]
+    plot_curves(curves, [folder / f"{name}.png"], panels=PAPER, axis="episodes")
+    plot_curves(curves, [folder / f"{name}_greedy.png"], panels=GREEDY, axis="episodes")
+    write_table(folder / f"{name}.csv", curves, axis="episodes")
+    lines += ["", f"![{study.title}: while training]({folder.name}/{name}.png)"]
+    lines += ["", f"![{study.title}: greedy play]({folder.name}/{name}_greedy.png)"]
+    for title, groups in tasks:
+        lines += ["", f"**{title}**" if len(tasks) > 1 else "", HEADER]
+        lines += [table_row(label, members) for label, members in groups.items()]
+    verdicts = []
+    for claim in study.claims:
+        for title, groups in tasks:
+            if claim.row in (None, title) and (verdict := claim.check(finals(groups))):
+                row = f"{title}: " if claim.row else ""
+                verdicts.append(f"| {row}{verdict.claim} | {verdict.outcome} | {verdict.measured} |")
+    if verdicts:
+        lines += ["", "| claim (of greedy play at the end) | | measured |", "|---|---|---|", *verdicts]
+    return "\n".join(lines)
+
+
+def rows_of_study(study: Study, found: list[Found], beside: list[Found]) -> list[tuple[str, dict[str, list[Found]]]]:
+    """Titles of a study's rows and the runs of their groups, by label."""
+    by_folder = {run.entry.run.folder: run for run in [*found, *beside]}
+    titles = sorted({value_of(run.entry, study.rows) for run in found}) if study.rows else [""]
+    rows = []
+    for title in titles:
+        entries = [run.entry for run in found if not study.rows or value_of(run.entry, study.rows) == title]
+        (row,) = rows_of(entries, study.by, pool=True)
+        groups = {label: [by_folder[entry.run.folder] for entry in members] for label, members in row.groups.items()}
+        for name in study.beside:
+            if runs := [run for run in beside if value_of(run.entry, "algo") == name]:
+                groups[name] = runs
+        rows.append((title or study.title, groups))
+    return rows
+
+
+def sum_up(title: str, groups: dict[str, list[Found]]) -> TaskResults:
+    """Curves of the groups of a row."""
+    columns = [name for panel in (*PAPER, *GREEDY) for name in panel if name]
+    summed = []
+    for label, members in groups.items():
+        entries = [each.entry for each in members]
+        runs = [entry.run for entry in entries]
+        estimates = estimate_curves(runs, columns, axis="episodes")
+        summed.append(Group(label, runs, estimates, common_references(entries, "known")))
+    return TaskResults(title, summed)
+
+
+def finals(groups: dict[str, list[Found]]) -> Results:
+    """Final values of the finished runs by quantity and group."""
+    import numpy as np
+
+    results: dict[str, dict[str, Any]] = {}
+    for label, members in groups.items():
+        runs = [each.entry.run for each in members if each.entry.run.summary]
+        if runs:
+            for name in QUANTITIES:
+                results.setdefault(name, {})[label] = np.array([final_value(run, f"greedy/{name}") for run in runs])
+    return results
+
+
+def table_row(label: str, members: list[Found]) -> str:
+    """Final results of a group as a line of a Markdown table."""
+    runs = [each.entry.run for each in members]
+    done = [run for run in runs if run.summary]
+    commits = ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
+    seeds = ", ".join(sorted(value_of(each.entry, "seed") for each in members if each.entry.run.summary))
+    if not done:
+        return f"| {label} | none finished | | | | | | | | | | {commits} |"
+    columns = [f"greedy/{name}" for name in QUANTITIES]
+    mean = {name: each.value[0] for name, each in estimate_finals(done, columns).items()}
+    score = estimate_finals(done, columns[:1])[columns[0]]
+    iqm = estimate_finals(done, columns[:1], center="iqm")[columns[0]].value[0]
+    interval = "" if score.low[0] != score.low[0] else f"{score.low[0]:.2f} to {score.high[0]:.2f}"
+    ceiling = done[0].summary.get("ceiling")
+    share = f"{mean[columns[0]] / ceiling:.0%}" if ceiling else ""
+    frames = sum(run.summary["frames"] for run in done) / len(done)
+    minutes = sum(run.summary["wall_seconds"] for run in done) / len(done) / 60
+    cells = (
+        label, seeds, f"{mean[columns[0]]:.2f}", interval, f"{iqm:.2f}", share, f"{mean[columns[2]]:.0%}",
+        f"{mean[columns[1]]:.0%}", f"{mean[columns[3]]:.1f}", f"{frames / 1000:.0f}k", f"{minutes:.0f} min", commits,
+    )  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def put(text: str, mark: str, part: str) -> str:
+    """Replaces what stands between a pair of marks, or adds both at the end.
+
+    Examples:
+        >>> put("before <!-- a -->\\nold\\n<!-- end of a --> after", "a", "new")
+        'before <!-- a -->\\nnew\\n<!-- end of a --> after'
+    """
+    begin, end = f"<!-- {mark} -->", f"<!-- end of {mark} -->"
+    marked = f"{begin}\n{part}\n{end}"
+    if begin not in text:
+        return f"{text.rstrip()}\n\n{marked}\n"
+    return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: marked, text, flags=re.DOTALL)
+
+
+def keep(runs: list[Found], archive: Path) -> None:
+    """Writes an archive that this program reads in place of the run folders; the same runs give the same bytes."""
+
+    def undated(member: tarfile.TarInfo) -> tarfile.TarInfo:
+        member.mtime, member.uid, member.gid, member.uname, member.gname = 0, 0, 0, "", ""
+        return member
+
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    partial = archive.with_name(archive.name + ".partial")
+    with tarfile.open(partial, "w:xz") as file:
+        for number, run in enumerate(sorted(runs, key=lambda run: sorted(map(str, run.settings.items())))):
+            for name in KEPT:
+                path = run.entry.run.folder / name
+                if path.exists():
+                    file.add(path, f"{number:03d}/{name}", filter=undated)
+    partial.replace(archive)
+
+
+if __name__ == "__main__":
+    command_line(Settings, __doc__, main)

@@ -1,0 +1,129 @@
+"""The paper's studies: which runs belong to each, how its figure is laid out, what the paper claims about it."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from hdrqn_torchrl.claims import Alike, Claim, Near, Ordered
+from resuming import FREE
+
+_IRRELEVANT = (*FREE, "logger", "device", "threads", "log_frames")  # to what is learned
+CONF = str(Path(__file__).parent / "conf")
+ALGORITHMS = Ordered("return", ["v2", "v1", "hdqn", ["drqn", "dqn"]])
+OURS = Ordered("return", ["v3", ["v1", "v2"]])
+
+
+@dataclass(frozen=True)
+class Study:
+    """One experiment of ``conf/experiment/``, and what is read off it."""
+
+    name: str
+    """File in ``conf/experiment/``."""
+    title: str
+    by: tuple[str, ...]
+    """What makes a group; see plot.py."""
+    rows: str | None = None
+    """Setting with a row of panels for each of its values."""
+    beside: tuple[str, ...] = ()
+    """Other algorithms' runs on the same task, shown for comparison: groups of the study ``gridworld``."""
+    claims: tuple[Claim, ...] = ()
+
+
+STUDIES = (
+    Study(
+        "sub_sequences",
+        "Length of the sub level's sequences, n^S, at n^M = 1",
+        by=("algo.sub.slice_len",),
+        rows="algo",
+        beside=("v3",),
+        claims=tuple(
+            claim
+            for row in ("v1", "v2")
+            for claim in (
+                Alike("return", ["slice_len=8", "slice_len=12"], row=row),
+                Ordered("return", [["slice_len=8", "slice_len=12"], ["slice_len=1", "slice_len=2"]], row=row),
+            )
+        ),
+    ),
+    Study(
+        "meta_sequences",
+        "Length of the meta level's sequences, n^M, at n^S = 8",
+        by=("algo.meta.slice_len",),
+        rows="algo",
+        beside=("v3",),
+        claims=(
+            Ordered("return", ["slice_len=1", "slice_len=2"], row="v1"),
+            Alike("return", ["slice_len=1", "slice_len=2"], row="v2"),
+        ),
+    ),
+    Study(
+        "views",
+        "How much the agent sees",
+        by=("env.view",),
+        rows="algo",
+        claims=tuple(Ordered("return", ["view=none", "view=5", "view=3"], row=row) for row in ("v1", "v2")),
+    ),
+    Study(
+        "gridworld",
+        "All algorithms, gridworld, two goals",
+        by=("algo",),
+        claims=(ALGORITHMS, Near("steps", "v2", 22.0, within=1.5), OURS),
+    ),
+    Study("gridworld_3_goals", "All algorithms, gridworld, three goals", by=("algo",), claims=(ALGORITHMS, OURS)),
+    Study("four_rooms", "All algorithms, four rooms, two goals", by=("algo",), claims=(ALGORITHMS, OURS)),
+    Study("four_rooms_3_goals", "All algorithms, four rooms, three goals", by=("algo",), claims=(ALGORITHMS, OURS)),
+    Study(
+        "authors_choices",
+        "What the paper leaves open and the authors' program decides",
+        by=("variant",),
+        beside=("v3",),
+    ),
+)
+
+
+def jobs_of(experiment: str) -> list[dict[str, Any]]:
+    """Settings of every run that ``python train.py -m experiment=...`` starts, interpolations left in.
+
+    Args:
+        experiment: file in ``conf/experiment/`` with a sweep.
+    """
+    parser = OverridesParser.create()
+    with initialize_config_dir(CONF, version_base="1.3"):
+        first = f"experiment={experiment}"
+        composed = compose("config", overrides=[first], return_hydra_config=True)
+        files, values = [], []  # composing takes long: once for each choice of files of conf/, not for each seed
+        for key, swept in composed.hydra.sweeper.params.items():
+            override = parser.parse_override(f"{key}={swept}")
+            several = override.sweep_string_iterator() if override.is_sweep_override() else [swept]
+            group = files if key in composed.hydra.runtime.choices else values
+            group.append([f"{key}={value}" for value in several])
+        jobs = [compose("config", overrides=[first, *chosen]) for chosen in itertools.product(*files)]
+    settings = [flat(OmegaConf.to_container(job, resolve=False)) for job in jobs]
+    given = [
+        {one.key_or_group: one.value() for one in parser.parse_overrides(list(each))}
+        for each in itertools.product(*values)
+    ]
+    return [job | changed for job in settings for changed in given]
+
+
+def flat(settings: Any, path: str = "") -> dict[str, Any]:
+    """Settings by their full names, without those that do not change what is learned."""
+    if not isinstance(settings, dict) or not settings:
+        return {path: settings}
+    found: dict[str, Any] = {}
+    for key, value in settings.items():
+        if path or key not in _IRRELEVANT:
+            found |= flat(value, f"{path}.{key}" if path else str(key))
+    return found
+
+
+def is_run_of(job: dict[str, Any], run: dict[str, Any]) -> bool:
+    """Whether a run was trained with a job's settings. Settings that are newer than the run are not asked for."""
+    return all(job.get(key) == value for key, value in run.items())

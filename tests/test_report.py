@@ -1,0 +1,155 @@
+import json
+import re
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+import report
+from configuration import command_line
+from studies import CONF, STUDIES, flat, is_run_of, jobs_of
+
+COLUMNS = (
+    "frames,episodes,updates,wall_seconds,behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/steps"
+)
+EXPERIMENTS = sorted(path.stem for path in (Path(CONF) / "experiment" / "paper").glob("*.yaml"))
+
+
+def make_run(folder, *overrides, score=1.0, finished=True):
+    """A run folder as train.py writes it."""
+    folder.mkdir(parents=True)
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = compose("config", overrides=list(overrides), return_hydra_config=True)
+    choices = {str(key): value for key, value in config.hydra.runtime.choices.items()}
+    config = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(config))
+    (folder / "run.json").write_text(json.dumps({"choices": choices, "commit": "0123456789"}))
+    rows = [f"{i * 100},{i * 7},{i * 10},{i * 60.5},{score * i},{50 - i},{score * i},{i / 4},20" for i in range(5)]
+    (folder / "metrics.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
+    if finished:
+        summary = {"return_mean": score, "success_rate": 0.75, "in_order_rate": 0.8, "steps_mean": 21.0}
+        (folder / "summary.json").write_text(json.dumps(summary | {"frames": 400, "wall_seconds": 60, "ceiling": 2.0}))
+    return folder
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Runs ``python report.py ARGUMENTS`` in this process and returns what it printed; errors end it with a message."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["report.py", *arguments])
+        try:
+            command_line(report.Settings, report.__doc__, report.main)
+        except SystemExit as ended:
+            return str(ended)
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def outputs(tmp_path):
+    study = "experiment=gridworld"
+    for algo, score in (("v2", 1.6), ("v1", 1.2), ("dqn", 0.2)):
+        for seed in (0, 1):
+            made = f"outputs/{algo}-seed{seed}"
+            make_run(tmp_path / made, study, f"algo={algo}", f"seed={seed}", score=score + seed / 100)
+    make_run(tmp_path / "outputs/hdqn", study, "algo=hdqn", finished=False)
+    make_run(tmp_path / "outputs/other", study, "algo=v2", "algo.gamma=0.9", score=9.0)
+    return tmp_path / "outputs"
+
+
+def test_figures_tables_and_claims_of_a_study(run, outputs):
+    assert run("runs=outputs", "out=results.md", "studies=gridworld") == "gridworld: runs 7, missing 11\n"
+    text = Path("results.md").read_text()
+    assert "`python train.py -m experiment=gridworld` (runs that have not been made yet: 11 of 18)" in text
+    row = next(line for line in text.splitlines() if line.startswith("| v2 |"))
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    expected = "v2", "0, 1", "1.60", "1.60 to 1.61", "1.60", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
+    assert tuple(cells) == expected
+    assert "| hdqn | none finished |" in text
+    assert "| v2 takes about 22 steps | agrees | v2 21 |" in text
+    assert "above hdqn" not in text  # it has not finished, so nothing is claimed of it
+    for name in ("gridworld.png", "gridworld_greedy.png", "gridworld.csv"):
+        assert (Path("results") / name).stat().st_size > 100
+    assert "(results/gridworld.png)" in text
+
+
+def test_claims_are_held_against_finished_runs(run, outputs):
+    for algo, score in (("hdqn", 0.8), ("drqn", 0.3)):
+        make_run(outputs / f"done-{algo}", "experiment=gridworld", f"algo={algo}", score=score)
+    run("runs=outputs", "out=results.md", "studies=gridworld")
+    claim = "| v2 above v1 above hdqn above drqn and dqn | agrees | v2 1.6, v1 1.21, hdqn 0.8, drqn 0.3, dqn 0.205 |"
+    assert claim in Path("results.md").read_text()
+
+
+def test_what_people_wrote_is_left_as_it_is(run, outputs):
+    run("runs=outputs", "out=results.md", "studies=gridworld")
+    generated = Path("results.md").read_text()
+    Path("results.md").write_text(generated.replace("# Results\n", "# Ours\n\nBefore.\n") + "\nAfter.\n")
+    run("runs=outputs", "out=results.md", "studies=gridworld")
+    assert Path("results.md").read_text() == generated.replace("# Results\n", "# Ours\n\nBefore.\n") + "\nAfter.\n"
+
+
+def test_an_archive_gives_the_same_report(run, outputs):
+    run("runs=outputs", "out=a.md", "studies=gridworld", "keep=kept/runs.tar.xz")
+    kept = Path("kept/runs.tar.xz").read_bytes()
+    run("runs=kept/runs.tar.xz", "out=b.md", "studies=gridworld", "keep=again.tar.xz")
+    assert Path("b.md").read_text() == Path("a.md").read_text().replace("(a/", "(b/")
+    assert Path("again.tar.xz").read_bytes() == kept
+    assert (Path("a") / "gridworld.csv").read_text() == (Path("b") / "gridworld.csv").read_text()
+
+
+def test_rows_of_a_study_and_agents_beside_it(run, tmp_path):
+    for algo in ("v1", "v2"):
+        for length in (1, 8):
+            settings = f"algo={algo}", f"algo.sub.slice_len={length}", "algo.meta.slice_len=1"
+            make_run(tmp_path / f"outputs/{algo}-{length}", "experiment=sub_sequences", *settings, score=length / 8)
+    make_run(tmp_path / "outputs/v3", "experiment=gridworld", "algo=v3")
+    assert run("runs=outputs", "out=results.md", "studies=sub_sequences") == "sub_sequences: runs 4, missing 26\n"
+    text = Path("results.md").read_text()
+    assert text.index("**v1**") < text.index("| slice_len=1 |") < text.index("| v3 |") < text.index("**v2**")
+
+
+def test_runs_of_another_size_do_not_count(run, outputs):
+    message = run("runs=outputs", "out=results.md", "studies=gridworld", "size=paper")
+    assert message == "gridworld: runs 0, missing 18\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["size=huge"], "error: size must be one of small, paper, got 'huge'."),
+        (["studies=gridword"], "error: studies must be some of .*, got 'gridword'."),
+        (["out=results.txt"], "error: out must end in .md, got 'results.txt'; "),
+        (["runs=broken.tar.xz"], "error: runs must name folders or readable archives, got broken.tar.xz: "),
+    ],
+)
+def test_wrong_settings(run, outputs, arguments, message):
+    Path("broken.tar.xz").write_text("no archive")
+    assert re.match(message, run("runs=outputs", *arguments))
+
+
+class TestStudies:
+    def test_each_experiment_of_the_paper_is_a_study(self):
+        assert sorted(study.name for study in STUDIES) == EXPERIMENTS
+
+    @pytest.mark.parametrize("study", STUDIES, ids=lambda study: study.name)
+    def test_jobs_of_both_sizes(self, study):
+        small, paper = jobs_of(study.name), jobs_of(f"paper/{study.name}")
+        assert len(small) == len(paper) >= 9
+        assert all(not is_run_of(job, other) for job in small for other in small if other is not job)
+        assert {job["seed"] for job in small} == {0, 1, 2}
+        assert all(job["network._target_"].endswith("paper_network") for job in paper)
+        assert min(job["total_frames"] for job in paper) > max(job["total_frames"] for job in small)
+
+    def test_what_runs_have_in_common(self):
+        job = flat({"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None})
+        assert job == {"seed": 0, "algo.gamma": 0.9, "algo.tau": 0.1}
+        assert is_run_of(job, job)
+        assert is_run_of(job, {"seed": 0, "algo.gamma": 0.9})  # it is older than tau
+        assert not is_run_of(job, job | {"algo.gamma": 0.8})
+        assert not is_run_of(job, job | {"algo.other": 1})
