@@ -108,7 +108,8 @@ class Alike:
         values = results.get(self.quantity, {})
         if not set(self.groups) <= set(values):
             return None
-        mean, low, high = difference(*(values[name] for name in self.groups))
+        first, second = (values[name] for name in self.groups)
+        mean, low, high = difference(first, second)
         apart = low > self.within or high < -self.within
         outcome = DISAGREES if apart else AGREES if abs(mean) <= self.within else OPEN
         return Verdict(" and ".join(self.groups) + " alike", outcome, _means(self.groups, values))
