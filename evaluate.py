@@ -13,7 +13,7 @@
     allowed_targets own builders that the run's settings may name, e.g. [my_package.MyEnv]
 
 Each figure is a mean over episodes; "intervals" are 95 % bootstrap intervals, "references" what scripted players
-achieve on the same task ("memory" has the agent's own view: the ceiling).
+achieve on the same task ("memory" has the agent's own view: the ceiling; "egocentric" must also find out where it is).
 """
 
 from __future__ import annotations

@@ -229,11 +229,12 @@ def references_of(entry: Entry, ceilings: str) -> References:
 def players(task: str, *, simulate: bool) -> References:
     """What the scripted players achieve on a grid task, given as JSON; empty if that is not known."""
     from hdrqn_torchrl.envs import MultiGoalGridEnv, ceiling  # takes seconds: it loads torch
+    from hdrqn_torchrl.envs.scripted import PLAYERS
 
     episodes = 1000 if simulate else 0  # no episodes are refused for tasks that have not been measured
     try:
         env = MultiGoalGridEnv(1, **json.loads(task))
-        return {player: ceiling(player, env, episodes=episodes) for player in ("planner", "memory", "random")}
+        return {player: ceiling(player, env, episodes=episodes) for player in PLAYERS}
     except (TypeError, ValueError):  # not measured, or settings of another version
         return {}
 

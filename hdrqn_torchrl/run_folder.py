@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.envs.ceilings import ceiling
+from hdrqn_torchrl.envs.scripted import PLAYERS
 from hdrqn_torchrl.plotting import plot_run, read_metrics
 from hdrqn_torchrl.trainer import Trainer
 
@@ -81,9 +82,9 @@ def references_for(env: EnvBase) -> References:
     """What the scripted players achieve on the task of ``env``, by name; empty for tasks that have none."""
     if not isinstance(env, MultiGoalGridEnv):
         return {}
-    return {player: ceiling(player, env) for player in ("planner", "memory", "random")}
+    return {player: ceiling(player, env) for player in PLAYERS}
 
 
 def ceiling_of(references: References) -> float | None:
-    """Return of the scripted player with the agent's own view; ``None`` if the task has none."""
+    """Return of the scripted player with the agent's own view and perfect memory; ``None`` if the task has none."""
     return references["memory"]["return_mean"] if "memory" in references else None

@@ -99,7 +99,7 @@ def test_the_contract(run, outputs, figures):
     returns, steps = figures[0].axes
     assert (returns.get_ylabel(), steps.get_ylabel()) == ("reward per episode", "steps per episode")
     assert [text.get_text() for text in figures[0].legends[0].get_texts()][:2] == ["dqn (2 seeds)", "v2 (2 seeds)"]
-    assert reference_lines(figures[0]) == [[2.0, 2.0, -0.91], [12.1, 15.5, 48.8]]
+    assert reference_lines(figures[0]) == [[2.0, 2.0, 2.0, -0.91], [12.1, 15.5, 16.5, 48.8]]
 
 
 @pytest.mark.parametrize(
@@ -197,8 +197,8 @@ def test_an_unmeasured_task_shows_the_ceiling_that_was_logged(run, tmp_path, fig
 def test_an_unmeasured_task_can_be_simulated(run, tmp_path, figures):
     make_run(tmp_path / "outputs/a", steps=12)
     run("runs=outputs", "out=a.png", "ceilings=simulate")
-    (planner, memory, random), _ = reference_lines(figures[0])
-    assert 2 > planner > memory > random
+    (planner, memory, egocentric, random), _ = reference_lines(figures[0])
+    assert 2 > planner > memory > egocentric > random
 
 
 def test_no_ceilings(run, outputs, figures):

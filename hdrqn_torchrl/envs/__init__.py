@@ -3,6 +3,7 @@
 from hdrqn_torchrl.envs.ceilings import ceiling
 from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
 from hdrqn_torchrl.envs.scripted import (
+    EgocentricSearch,
     FullInformationPlanner,
     PerfectMemorySearch,
     UniformRandom,
@@ -11,6 +12,7 @@ from hdrqn_torchrl.envs.scripted import (
 )
 
 __all__ = [
+    "EgocentricSearch",
     "FullInformationPlanner",
     "MultiGoalGridEnv",
     "PerfectMemorySearch",

@@ -22,27 +22,40 @@ class Task(NamedTuple):
     view: int | None
 
 
+_LOOKING: tuple[PlayerName, ...] = ("memory", "egocentric")  # players that look through the window
 MEASURED_EPISODES = 20_000
 MEASURED: dict[Task, tuple[float, float, float]] = {  # return_mean, success_rate, steps_mean
     Task("planner", "open", 2, 50, None): (2.000, 1.0000, 12.1),
     Task("memory", "open", 2, 50, None): (2.000, 1.0000, 12.1),
     Task("memory", "open", 2, 50, 5): (2.000, 1.0000, 15.5),
     Task("memory", "open", 2, 50, 3): (2.000, 0.9997, 22.5),
+    Task("egocentric", "open", 2, 50, None): (2.000, 1.0000, 12.1),
+    Task("egocentric", "open", 2, 50, 5): (2.000, 1.0000, 16.5),
+    Task("egocentric", "open", 2, 50, 3): (1.994, 0.9946, 25.1),
     Task("random", "open", 2, 50, None): (-0.910, 0.0315, 48.8),
     Task("planner", "open", 3, 50, None): (3.000, 1.0000, 18.1),
     Task("memory", "open", 3, 50, None): (3.000, 1.0000, 18.1),
     Task("memory", "open", 3, 50, 5): (3.000, 0.9999, 21.8),
     Task("memory", "open", 3, 50, 3): (2.991, 0.9913, 29.6),
+    Task("egocentric", "open", 3, 50, None): (3.000, 1.0000, 18.1),
+    Task("egocentric", "open", 3, 50, 5): (3.000, 0.9998, 23.0),
+    Task("egocentric", "open", 3, 50, 3): (2.956, 0.9624, 32.2),
     Task("random", "open", 3, 50, None): (-0.961, 0.0022, 49.8),
     Task("planner", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
     Task("memory", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
     Task("memory", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
     Task("memory", "four_rooms", 2, 50, 3): (1.949, 0.9907, 25.2),
+    Task("egocentric", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
+    Task("egocentric", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
+    Task("egocentric", "four_rooms", 2, 50, 3): (1.947, 0.9889, 26.0),
     Task("random", "four_rooms", 2, 50, None): (-1.170, 0.0231, 49.0),
     Task("planner", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
     Task("memory", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
     Task("memory", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
     Task("memory", "four_rooms", 3, 100, 3): (2.882, 0.9892, 34.1),
+    Task("egocentric", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
+    Task("egocentric", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
+    Task("egocentric", "four_rooms", 3, 100, 3): (2.882, 0.9892, 35.1),
     Task("random", "four_rooms", 3, 100, None): (-2.566, 0.0056, 98.8),
 }
 
@@ -51,7 +64,8 @@ def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, 
     """What a scripted player achieves on a task: looked up for the paper's tasks, simulated for all others.
 
     Args:
-        player: ``"planner"`` (full information), ``"memory"`` (remembers all it saw) or ``"random"``.
+        player: ``"planner"`` (full information), ``"memory"`` (remembers all it saw, and knows where it is),
+            ``"egocentric"`` (remembers all it saw, and must find out where it is) or ``"random"``.
         env: the environment whose task is meant; it is not played.
         episodes: number of episodes of a simulation.
         seed: seed of a simulation.
@@ -69,7 +83,7 @@ def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, 
     """
     task = env.task
     if task["obstacle"] == "stay" and task["num_obstacles"] == 2 and isinstance(task["layout"], str):
-        view = task["view"] if player == "memory" else None
+        view = task["view"] if player in _LOOKING else None
         figures = MEASURED.get(Task(player, task["layout"], task["num_goals"], task["max_steps"], view))
         if figures is not None:
             names = ("return_mean", "success_rate", "steps_mean")
@@ -86,8 +100,9 @@ def standard_tasks() -> Iterator[Task]:
         ("four_rooms", 3, 100),
     ):
         yield Task("planner", layout, num_goals, max_steps, None)
-        for view in (None, 5, 3):
-            yield Task("memory", layout, num_goals, max_steps, view)
+        for player in _LOOKING:
+            for view in (None, 5, 3):
+                yield Task(player, layout, num_goals, max_steps, view)
         yield Task("random", layout, num_goals, max_steps, None)
 
 

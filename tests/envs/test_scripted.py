@@ -3,6 +3,7 @@ import torch
 from torchrl.envs.utils import step_mdp
 
 from hdrqn_torchrl.envs import (
+    EgocentricSearch,
     FullInformationPlanner,
     MultiGoalGridEnv,
     PerfectMemorySearch,
@@ -129,14 +130,15 @@ def test_the_planner_walks_round_obstacles_and_later_goals():
     assert play_world(env, FullInformationPlanner(env), 4, [5, 7, 1])[:5] == [0, 0, 0, 0, 1]
 
 
-def test_the_memory_player_is_not_moved_by_what_it_has_not_seen():
+@pytest.mark.parametrize("player", [PerfectMemorySearch, EgocentricSearch])
+def test_players_are_not_moved_by_what_they_have_not_seen(player):
     env = MultiGoalGridEnv(500, num_goals=3, view=5, seed=0)
     start, state = env.reset(), env.state
     seen = (env.rules.window_cells[state.agent][:, :, None] == state.objects[:, None, :]).any(1)
-    usual = PerfectMemorySearch(env)(start.clone())["action"]
+    usual = player(env)(start.clone())["action"]
     env.state = state._replace(objects=torch.where(seen, state.objects, env.rules.nowhere))
     assert (env.rules.observe(env.state) == start["observation"]).all()
-    assert (PerfectMemorySearch(env)(start.clone())["action"] == usual).all()
+    assert (player(env)(start.clone())["action"] == usual).all()
     env.state = state
 
 
@@ -147,18 +149,19 @@ def test_the_memory_player_finds_back_to_a_goal_that_it_saw_earlier():
     assert rewards[5] == rewards[-1] == 1
 
 
-def test_the_memory_player_forgets_at_the_end_of_an_episode():
+@pytest.mark.parametrize("player", [PerfectMemorySearch, EgocentricSearch])
+def test_players_forget_at_the_end_of_an_episode(player):
     env = MultiGoalGridEnv(20, view=3, max_steps=30, seed=0)
-    used = PerfectMemorySearch(env)
+    used = player(env)
     play_episodes(env, used)
-    tensordict, new = env.reset(), PerfectMemorySearch(env)
+    tensordict, new = env.reset(), player(env)
     for _ in range(10):
         actions = used(tensordict.clone())["action"]
         assert (new(tensordict.clone())["action"] == actions).all()
         tensordict = step_mdp(env.step(tensordict.set("action", actions)))
 
 
-@pytest.mark.parametrize("player", [FullInformationPlanner, PerfectMemorySearch])
+@pytest.mark.parametrize("player", [FullInformationPlanner, PerfectMemorySearch, EgocentricSearch])
 def test_players_avoid_obstacles_in_rollouts_over_many_episodes(player):
     env = MultiGoalGridEnv(16, num_goals=3, seed=0)
     rollout = env.rollout(100, player(env), break_when_any_done=False)
@@ -199,6 +202,8 @@ def test_ceiling_looks_standard_tasks_up_and_simulates_others():
     row = MEASURED[Task("memory", "four_rooms", 3, 100, 3)]
     assert (known["return_mean"], known["success_rate"], known["steps_mean"]) == row
     assert known["episodes"] == MEASURED_EPISODES
+    for player in ("memory", "egocentric"):
+        assert ceiling(player, MultiGoalGridEnv(view=3)) != ceiling(player, MultiGoalGridEnv(view=5))
     # The planner does not look through the window.
     assert ceiling("planner", MultiGoalGridEnv(view=3)) == ceiling("planner", MultiGoalGridEnv(view=5))
     for other in ({"num_goals": 1}, {"view": 7}, {"obstacle": "teleport"}, {"num_obstacles": 1}, {"layout": [" " * 9]}):
