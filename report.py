@@ -29,10 +29,10 @@ from configuration import SettingsError, command_line
 from hdrqn_torchrl.claims import Results
 from hdrqn_torchrl.comparison import GREEDY, PAPER, plot_curves
 from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
-from hdrqn_torchrl.grouping import Entry, rows_of, value_of
+from hdrqn_torchrl.grouping import Entry, value_of
 from hdrqn_torchrl.results import final_value
 from plot import YAML_LOADER, as_list, common_references, read_entries
-from studies import STUDIES, Study, flat, is_run_of, jobs_of
+from studies import STUDIES, Job, Study, flat, is_run_of, jobs_of
 
 KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json")
 SIZES = ("small", "paper")
@@ -57,13 +57,17 @@ class Settings:
 
 @dataclass(frozen=True)
 class Found:
-    """A run of a study."""
+    """A run."""
 
     entry: Entry
     settings: dict[str, Any]
     """As :func:`studies.flat` gives them."""
     origin: dict[str, Any]
     """``run.json``"""
+
+
+Runs = list[tuple[Job, Found]]
+"""Runs of a study and what each stands for in it; a run may stand for something in several studies."""
 
 
 def main(settings: Settings) -> None:
@@ -85,7 +89,7 @@ def main(settings: Settings) -> None:
         for study in STUDIES:
             if study.name in wanted:
                 found, missing = runs_of_jobs(study.name, settings.size, runs)
-                used |= {each.entry.run.folder: each for each in found}
+                used |= {run.entry.run.folder: run for _, run in found}
                 text = put(text, f"{study.name} {settings.size}", section(study, found, missing, everywhere, settings))
                 print(f"{study.name}: runs {len(found)}, missing {missing}")
         if settings.keep:
@@ -115,7 +119,7 @@ def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
     return found
 
 
-def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[list[Found], int]:
+def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[Runs, int]:
     """The run of each job of an experiment that has one, and the number of jobs that have none.
 
     Of several runs of one job the finished one that went furthest counts.
@@ -124,13 +128,14 @@ def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[list[Fo
     for job in jobs_of(experiment if size == "small" else f"paper/{experiment}"):
         same = [run for run in runs if is_run_of(job, run.settings)]
         if same:
-            found.append(max(same, key=lambda run: (bool(run.entry.run.summary), run.entry.run.metrics["frames"][-1])))
+            furthest = max(same, key=lambda run: (bool(run.entry.run.summary), run.entry.run.metrics["frames"][-1]))
+            found.append((job, furthest))
         else:
             missing += 1
     return found, missing
 
 
-def section(study: Study, found: list[Found], missing: int, everywhere: list[Found], settings: Settings) -> str:
+def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> str:
     """Figure, table and claims of a study as Markdown; writes the figure and its data."""
     experiment = study.name if settings.size == "small" else f"paper/{study.name}"
     lines = [f"`python train.py -m experiment={experiment}`"]
@@ -138,7 +143,7 @@ def section(study: Study, found: list[Found], missing: int, everywhere: list[Fou
         lines[0] += f" (runs that have not been made yet: {missing} of {missing + len(found)})"
     if not found:
         return lines[0]
-    beside = [run for run in everywhere if value_of(run.entry, "algo") in study.beside]
+    beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]
     tasks = rows_of_study(study, found, beside)
     folder = Path(settings.out).with_suffix("")
     name = study.name if settings.size == "small" else f"{study.name}_paper"
@@ -162,20 +167,16 @@ def section(study: Study, found: list[Found], missing: int, everywhere: list[Fou
     return "\n".join(lines)
 
 
-def rows_of_study(study: Study, found: list[Found], beside: list[Found]) -> list[tuple[str, dict[str, list[Found]]]]:
+def rows_of_study(study: Study, found: Runs, beside: Runs) -> list[tuple[str, dict[str, list[Found]]]]:
     """Titles of a study's rows and the runs of their groups, by label."""
-    by_folder = {run.entry.run.folder: run for run in [*found, *beside]}
-    titles = sorted({value_of(run.entry, study.rows) for run in found}) if study.rows else [""]
-    rows = []
-    for title in titles:
-        entries = [run.entry for run in found if not study.rows or value_of(run.entry, study.rows) == title]
-        (row,) = rows_of(entries, study.by, pool=True)
-        groups = {label: [by_folder[entry.run.folder] for entry in members] for label, members in row.groups.items()}
-        for name in study.beside:
-            if runs := [run for run in beside if value_of(run.entry, "algo") == name]:
-                groups[name] = runs
-        rows.append((title or study.title, groups))
-    return rows
+    rows: dict[str, dict[str, list[Found]]] = {}
+    for job, run in found:
+        row = rows.setdefault(job.label([study.rows]) if study.rows else study.title, {})
+        row.setdefault(job.label(study.by), []).append(run)
+    for row in rows.values():
+        for job, run in beside:
+            row.setdefault(job.overrides["algo"], []).append(run)
+    return list(rows.items())
 
 
 def sum_up(title: str, groups: dict[str, list[Found]]) -> TaskResults:

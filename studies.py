@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,9 @@ class Study:
     """File in ``conf/experiment/``."""
     title: str
     by: tuple[str, ...]
-    """What makes a group; see plot.py."""
+    """What makes a group: some of what the experiment sweeps over."""
     rows: str | None = None
-    """Setting with a row of panels for each of its values."""
+    """What has a row of panels for each of its values."""
     beside: tuple[str, ...] = ()
     """Other algorithms' runs on the same task, shown for comparison: groups of the study ``gridworld``."""
     claims: tuple[Claim, ...] = ()
@@ -88,8 +89,30 @@ STUDIES = (
 )
 
 
-def jobs_of(experiment: str) -> list[dict[str, Any]]:
-    """Settings of every run that ``python train.py -m experiment=...`` starts, interpolations left in.
+@dataclass(frozen=True)
+class Job:
+    """One run of a study."""
+
+    overrides: dict[str, str]
+    """What the sweep sets, as text."""
+    settings: dict[str, Any]
+    """All settings by their full names (:func:`flat`), interpolations left in."""
+
+    def label(self, keys: Iterable[str]) -> str:
+        """Values of some of its overrides, names of files of conf/ as they are.
+
+        Examples:
+            >>> Job({"algo": "v2", "algo.sub.slice_len": "8"}, {}).label(["algo", "algo.sub.slice_len"])
+            'v2, slice_len=8'
+        """
+        parts = (key.rpartition(".") for key in keys)
+        return ", ".join(
+            f"{last}={self.overrides[f'{path}.{last}']}" if path else self.overrides[last] for path, _, last in parts
+        )
+
+
+def jobs_of(experiment: str) -> list[Job]:
+    """Every run that ``python train.py -m experiment=...`` starts.
 
     Args:
         experiment: file in ``conf/experiment/`` with a sweep.
@@ -103,14 +126,15 @@ def jobs_of(experiment: str) -> list[dict[str, Any]]:
             override = parser.parse_override(f"{key}={swept}")
             several = override.sweep_string_iterator() if override.is_sweep_override() else [swept]
             group = files if key in composed.hydra.runtime.choices else values
-            group.append([f"{key}={value}" for value in several])
-        jobs = [compose("config", overrides=[first, *chosen]) for chosen in itertools.product(*files)]
-    settings = [flat(OmegaConf.to_container(job, resolve=False)) for job in jobs]
-    given = [
-        {one.key_or_group: one.value() for one in parser.parse_overrides(list(each))}
-        for each in itertools.product(*values)
-    ]
-    return [job | changed for job in settings for changed in given]
+            group.append([(key, str(value)) for value in several])
+        jobs = []
+        for chosen in itertools.product(*files):
+            config = compose("config", overrides=[first, *map("=".join, chosen)])
+            settings = flat(OmegaConf.to_container(config, resolve=False))
+            for given in itertools.product(*values):
+                set_ = {key: parser.parse_override(f"{key}={value}").value() for key, value in given}
+                jobs.append(Job(dict([*chosen, *given]), settings | set_))
+    return jobs
 
 
 def flat(settings: Any, path: str = "") -> dict[str, Any]:
@@ -124,6 +148,6 @@ def flat(settings: Any, path: str = "") -> dict[str, Any]:
     return found
 
 
-def is_run_of(job: dict[str, Any], run: dict[str, Any]) -> bool:
+def is_run_of(job: Job, run: dict[str, Any]) -> bool:
     """Whether a run was trained with a job's settings. Settings that are newer than the run are not asked for."""
-    return all(job.get(key) == value for key, value in run.items())
+    return all(job.settings.get(key) == value for key, value in run.items())

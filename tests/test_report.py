@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 
 import report
 from configuration import command_line
-from studies import CONF, STUDIES, flat, is_run_of, jobs_of
+from studies import CONF, STUDIES, Job, flat, is_run_of, jobs_of
 
 COLUMNS = (
     "frames,episodes,updates,wall_seconds,behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/steps"
@@ -114,6 +114,14 @@ def test_rows_of_a_study_and_agents_beside_it(run, tmp_path):
     assert text.index("**v1**") < text.index("| slice_len=1 |") < text.index("| v3 |") < text.index("**v2**")
 
 
+def test_a_run_stands_for_what_a_study_calls_it(run, outputs):
+    """The variant v2 of one study is the algorithm v2 of another."""
+    make_run(outputs / "cell", "experiment=authors_choices", "variant=v2_cell")
+    assert run("runs=outputs", "out=results.md", "studies=authors_choices") == "authors_choices: runs 3, missing 15\n"
+    rows = [line.split("|")[1].strip() for line in Path("results.md").read_text().splitlines() if line[:4] == "| v2"]
+    assert rows == ["v2", "v2_cell"]
+
+
 def test_runs_of_another_size_do_not_count(run, outputs):
     message = run("runs=outputs", "out=results.md", "studies=gridworld", "size=paper")
     assert message == "gridworld: runs 0, missing 18\n"
@@ -141,15 +149,17 @@ class TestStudies:
     def test_jobs_of_both_sizes(self, study):
         small, paper = jobs_of(study.name), jobs_of(f"paper/{study.name}")
         assert len(small) == len(paper) >= 9
-        assert all(not is_run_of(job, other) for job in small for other in small if other is not job)
-        assert {job["seed"] for job in small} == {0, 1, 2}
-        assert all(job["network._target_"].endswith("paper_network") for job in paper)
-        assert min(job["total_frames"] for job in paper) > max(job["total_frames"] for job in small)
+        assert all(is_run_of(job, other.settings) == (job is other) for job in small for other in small)
+        assert {job.settings["seed"] for job in small} == {0, 1, 2}
+        assert all(job.settings["network._target_"].endswith("paper_network") for job in paper)
+        assert min(job.settings["total_frames"] for job in paper) > max(job.settings["total_frames"] for job in small)
+        assert all(job.label(study.by) for job in small)
 
     def test_what_runs_have_in_common(self):
-        job = flat({"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None})
-        assert job == {"seed": 0, "algo.gamma": 0.9, "algo.tau": 0.1}
-        assert is_run_of(job, job)
+        settings = flat({"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None})
+        assert settings == {"seed": 0, "algo.gamma": 0.9, "algo.tau": 0.1}
+        job = Job({}, settings)
+        assert is_run_of(job, settings)
         assert is_run_of(job, {"seed": 0, "algo.gamma": 0.9})  # it is older than tau
-        assert not is_run_of(job, job | {"algo.gamma": 0.8})
-        assert not is_run_of(job, job | {"algo.other": 1})
+        assert not is_run_of(job, settings | {"algo.gamma": 0.8})
+        assert not is_run_of(job, settings | {"algo.other": 1})
