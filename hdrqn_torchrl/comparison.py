@@ -61,6 +61,7 @@ _PLAYERS: dict[str, tuple[str, Any]] = {  # line style and name of the scripted 
 }
 _GREY, _HATCH = "0.45", "////"
 _PANEL_SIZE = (2.7, 2.1)  # inches
+_MANY = 8  # bars; more of them lie on their side, with their names once at the left
 _STYLE: Any = {
     "font.size": 8,
     "axes.titlesize": 9,
@@ -142,18 +143,21 @@ def plot_bars(
         ValueError: if there are no data for any panel.
     """
     panels = _with_data(panels, tasks)
-    figure, rows = _grid_of_panels(tasks, panels, title)
+    most = max(len(task.groups) for task in tasks)
+    lying = most > _MANY
+    figure, rows = _grid_of_panels(tasks, panels, title, height=0.16 * most + 0.6 if lying else None)
     colors = {label: style[0] for label, style in _styles(tasks).items()}
     for task, row in zip(tasks, rows, strict=True):
         for panel, place in zip(panels, row, strict=True):
             for position, group in enumerate(task.groups):
                 if panel.column in group.estimates:
-                    _draw_bar(place, position, group, group.estimates[panel.column], colors[group.label])
-            _draw_references(place, task.groups, panel.column, colors)
-            _finish_panel(place, panel.column)
-            _name_bars(place, [group.label for group in task.groups])
+                    _draw_bar(place, position, group, group.estimates[panel.column], colors[group.label], lying)
+            _draw_references(place, task.groups, panel.column, colors, lying)
+            _finish_panel(place, panel.column, lying)
+            _name_bars(place, [group.label for group in task.groups], lying, shown=not lying or place is row[0])
     unfinished = any(not run.summary for task in tasks for group in task.groups for run in group.runs)
-    handles = [Patch(color=color, alpha=0.75, label=_with_seeds(label, tasks)) for label, color in colors.items()]
+    named = {} if lying else colors
+    handles = [Patch(color=color, alpha=0.75, label=_with_seeds(label, tasks)) for label, color in named.items()]
     meaning = [_dot("finished run", _GREY), *([_dot("unfinished run", "white"), _hatched()] if unfinished else [])]
     _legend(figure, handles, [*meaning, *_reference_handles(tasks, panels)], _caption(tasks, center))
     _save(figure, paths)
@@ -168,10 +172,11 @@ def _with_data(panels: Sequence[Panel], tasks: Sequence[TaskResults]) -> list[Pa
 
 
 def _grid_of_panels(
-    tasks: Sequence[TaskResults], panels: Sequence[Panel], title: str
+    tasks: Sequence[TaskResults], panels: Sequence[Panel], title: str, height: float | None = None
 ) -> tuple[Figure, list[list[Axes]]]:
     """A figure with one row of panels for each task."""
-    width, height = _PANEL_SIZE
+    width, usual = _PANEL_SIZE
+    height = usual if height is None else height
     with matplotlib.rc_context(_STYLE):
         figure = Figure(
             figsize=(max(width * len(panels), 5.0), height * len(tasks) + 0.3),
@@ -258,53 +263,68 @@ def _distances(points: Estimate) -> Array:
     return np.stack([points.value - points.low, points.high - points.value]).clip(min=0)
 
 
-def _draw_bar(place: Axes, position: int, group: Group, final: Estimate, color: str) -> None:
+def _draw_bar(place: Axes, position: int, group: Group, final: Estimate, color: str, lying: bool) -> None:
     partly = not all(run.summary for run in group.runs)
-    place.bar(position, final.value, 0.7, color=color, alpha=0.75, hatch=_HATCH if partly else "", edgecolor="white")
-    place.errorbar(position, final.value, yerr=_distances(final), color="black", elinewidth=1.4, capsize=4, zorder=3)
+    look: Any = {"color": color, "alpha": 0.75, "hatch": _HATCH if partly else "", "edgecolor": "white"}
+    error: Any = {"color": "black", "linestyle": "", "elinewidth": 1.4, "capsize": 2 if lying else 4, "zorder": 3}
+    if lying:
+        place.barh(position, final.value, 0.7, **look)
+        place.errorbar(final.value, position, xerr=_distances(final), **error)
+    else:
+        place.bar(position, final.value, 0.7, **look)
+        place.errorbar(position, final.value, yerr=_distances(final), **error)
     offsets = np.linspace(-0.22, 0.22, len(group.runs)) if len(group.runs) > 1 else [0.0]
     for run, value, offset in zip(group.runs, final.samples[:, 0], offsets, strict=True):
-        face = color if run.summary else "white"
+        at = (value, position + offset) if lying else (position + offset, value)
         place.plot(
-            position + offset,
-            value,
+            *at,
             "o",
-            markersize=3,
-            markerfacecolor=face,
+            markersize=2 if lying else 3,
+            markerfacecolor=color if run.summary else "white",
             markeredgecolor="black",
             markeredgewidth=0.6,
             zorder=4,
         )
 
 
-def _name_bars(place: Axes, labels: Sequence[str]) -> None:
+def _name_bars(place: Axes, labels: Sequence[str], lying: bool, *, shown: bool) -> None:
+    ends = -0.6, len(labels) - 0.4
+    if lying:
+        place.set_yticks(range(len(labels)), labels if shown else [""] * len(labels))
+        place.set_ylim(*reversed(ends))  # the first on top
+        place.grid(False, axis="y")
+        return
     place.set_xticks(range(len(labels)), labels)
     if sum(len(label) + 2 for label in labels) > 30:
         place.tick_params("x", labelrotation=35)
         for name in place.get_xticklabels():
             name.set(ha="right", rotation_mode="anchor")
-    place.set_xlim(-0.6, len(labels) - 0.4)
+    place.set_xlim(*ends)
     place.grid(False, axis="x")
 
 
-def _finish_panel(place: Axes, column: str) -> None:
+def _finish_panel(place: Axes, column: str, lying: bool = False) -> None:
     source, _, name = column.rpartition("/")
     known = source in ("behaviour", "greedy") and name in _QUANTITIES
-    place.set_ylabel(_QUANTITIES[name] if known else column)
+    values = place.xaxis if lying else place.yaxis
+    values.set_label_text(_QUANTITIES[name] if known else column)
     if known and name in _SHARES:
-        place.set_ylim(-0.03, 1.05)
-        place.yaxis.set_major_formatter(PercentFormatter(1.0))
+        (place.set_xlim if lying else place.set_ylim)(-0.03, 1.05)
+        values.set_major_formatter(PercentFormatter(1.0))
     place.grid(alpha=0.25, linewidth=0.6)
 
 
-def _draw_references(place: Axes, groups: Sequence[Group], column: str, colors: dict[str, str]) -> None:
+def _draw_references(
+    place: Axes, groups: Sequence[Group], column: str, colors: dict[str, str], lying: bool = False
+) -> None:
     """Scripted players as lines: grey where the groups share them, else in the colours of the groups."""
     for player, (_, dashes) in _PLAYERS.items():
         results = {group.label: _reference(group, player, column) for group in groups}
         shared = set(results.values())
         for label, value in results.items() if len(shared) > 1 else [("", shared.pop())]:
             if value is not None:
-                place.axhline(value, color=colors.get(label, _GREY), linestyle=dashes, linewidth=1.1, zorder=1.5)
+                draw = place.axvline if lying else place.axhline
+                draw(value, color=colors.get(label, _GREY), linestyle=dashes, linewidth=1.1, zorder=1.5)
 
 
 def _reference(group: Group, player: str, column: str) -> float | None:

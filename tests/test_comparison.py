@@ -200,6 +200,20 @@ def test_finished_runs_need_no_explanation(tmp_path, figures):
     assert legend_of(figures[0]) == ["v1 (1 seed)", "finished run"]
 
 
+def test_many_bars_lie_on_their_side_with_their_names_once(tmp_path, figures):
+    groups = [Group(f"g{i}", [run_of(i), run_of(i + 1)], finals("", [run_of(i), run_of(i + 1)]).estimates, MEMORY)
+              for i in range(9)]  # fmt: skip
+    plot_bars(one_task(*groups), [tmp_path / "a.png"], panels=GREEDY[:2])
+    first, second = figures[0].axes
+    assert [bar.get_width() for bar in first.patches] == [10.5 + i for i in range(9)]
+    assert [label.get_text() for label in first.get_yticklabels()] == [f"g{i}" for i in range(9)]
+    assert {label.get_text() for label in second.get_yticklabels()} == {""}
+    assert first.get_ylim()[0] > first.get_ylim()[1]  # the first on top
+    assert first.get_xlabel() == "reward per episode" and second.get_xlim() == (-0.03, 1.05)
+    assert [line.get_xdata()[0] for line in first.get_lines() if list(line.get_ydata()) == [0, 1]] == [2.0]
+    assert legend_of(figures[0])[0] == "finished run"
+
+
 @pytest.mark.parametrize("plot", [plot_curves, plot_bars])
 def test_no_data_at_all_is_an_error(tmp_path, plot):
     with pytest.raises(ValueError, match="panels must name columns that a group has estimates for, got sub/loss"):
