@@ -1,6 +1,6 @@
 """Runs summed up over seeds: learning curves and final results with confidence intervals.
 
-Neither figures (``comparison.py``) nor settings (``plot.py``) are known here: runs come in, arrays go out.
+Neither figures (``comparison``) nor settings (``plot.py``) are known here: runs come in, arrays go out.
 """
 
 from __future__ import annotations
