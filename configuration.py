@@ -1,6 +1,6 @@
 """From settings to built objects: rules for every setting, the allow-list of what may be built, runs read back.
 
-Beside the entry points only this file, resuming.py and sweeps.py know hydra and omegaconf.
+Beside the entry points only this file, resuming.py, sweeps.py and studies.py know hydra and omegaconf.
 """
 
 from __future__ import annotations
