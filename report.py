@@ -87,7 +87,7 @@ def main(settings: Settings) -> None:
         runs = read_runs([str(each) for each in as_list(settings.runs)], stack)
         everywhere = runs_of_jobs("gridworld", settings.size, runs)[0]
         for study in STUDIES:
-            if study.name in wanted:
+            if study.name in wanted and settings.size in study.sizes:
                 found, missing = runs_of_jobs(study.name, settings.size, runs)
                 used |= {run.entry.run.folder: run for _, run in found}
                 text = put(text, f"{study.name} {settings.size}", section(study, found, missing, everywhere, settings))
@@ -154,7 +154,7 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
     lines += ["", f"![{study.title}: while training]({folder.name}/{name}.png)"]
     lines += ["", f"![{study.title}: greedy play]({folder.name}/{name}_greedy.png)"]
     for title, groups in tasks:
-        lines += ["", f"**{title}**" if len(tasks) > 1 else "", HEADER]
+        lines += ["", f"**{title}**", "", HEADER] if len(tasks) > 1 else ["", HEADER]
         lines += [table_row(label, members) for label, members in groups.items()]
     verdicts = []
     for claim in study.claims:

@@ -35,6 +35,8 @@ class Study:
     beside: tuple[str, ...] = ()
     """Other algorithms' runs on the same task, shown for comparison: groups of the study ``gridworld``."""
     claims: tuple[Claim, ...] = ()
+    sizes: tuple[str, ...] = ("small", "paper")
+    """In which it exists."""
 
 
 STUDIES = (
@@ -85,6 +87,20 @@ STUDIES = (
         "What the paper leaves open and the authors' program decides",
         by=("variant",),
         beside=("v3",),
+    ),
+    Study(
+        "tuning_flat",
+        "Search for the settings of DQN and DRQN",
+        by=("algo.learner.learning_rate", "algo.learner.tau"),
+        rows="algo",
+        sizes=("small",),
+    ),
+    Study(
+        "tuning_hierarchical",
+        "Search for the settings of hDQN, v1 and v2",
+        by=("algo.sub.learning_rate", "algo.sub.tau"),
+        rows="algo",
+        sizes=("small",),
     ),
 )
 

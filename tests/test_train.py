@@ -353,7 +353,7 @@ class TestWhatIsLeftAlone:
         told = self.refused(a_run.parent, "resume=run", "seed=5", "algo.sub.tau=0.5")
         assert told[-4:-1] == [
             "error: settings must be those of the run that is resumed, and differ from run:",
-            "  algo.sub.tau: 0.01 -> 0.5",
+            "  algo.sub.tau: 0.003 -> 0.5",
             "  seed: 0 -> 5",
         ]
         assert snapshot(a_run) == before
