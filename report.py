@@ -8,7 +8,7 @@ runs      folders, glob patterns or archives (.tar.xz) that an earlier report ke
 out       text to write; its figures and tables go to a folder of the same name. What stands in it outside of the
           marked parts is left as it is
 size      small (default) or paper: which of a study's two sizes
-studies   only these: studies=gridworld,views
+studies   only these: studies=gridworld,views; without it there is also an overview of all claims
 keep      archive (.tar.xz) to put the runs' settings and measurements into; weights are not kept
 """
 
@@ -41,6 +41,7 @@ HEADER = (
     "| | seeds | return | 95 % interval | IQM | share of the ceiling | in order | all in order | steps | frames "
     "| wall time | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
+CLAIMS = "| claim (of greedy play at the end) | | measured |\n|---|---|---|"
 _NAMES = [study.name for study in STUDIES]
 
 
@@ -83,6 +84,7 @@ def main(settings: Settings) -> None:
     out.with_suffix("").mkdir(parents=True, exist_ok=True)
     text = out.read_text() if out.exists() else "# Results\n"
     used: dict[Path, Found] = {}
+    overview = [CLAIMS.replace("|", "| study |", 1).replace("|---", "|---|---", 1)]
     with ExitStack() as stack:
         runs = read_runs([str(each) for each in as_list(settings.runs)], stack)
         everywhere = runs_of_jobs("gridworld", settings.size, runs)[0]
@@ -90,8 +92,12 @@ def main(settings: Settings) -> None:
             if study.name in wanted and settings.size in study.sizes:
                 found, missing = runs_of_jobs(study.name, settings.size, runs)
                 used |= {run.entry.run.folder: run for _, run in found}
-                text = put(text, f"{study.name} {settings.size}", section(study, found, missing, everywhere, settings))
+                part, claims = section(study, found, missing, everywhere, settings)
+                text = put(text, f"{study.name} {settings.size}", part)
+                overview += [f"| {study.title} {line}" for line in claims]
                 print(f"{study.name}: runs {len(found)}, missing {missing}")
+        if not settings.studies:
+            text = put(text, f"claims {settings.size}", "\n".join(overview))
         if settings.keep:
             keep(list(used.values()), Path(settings.keep))
     out.write_text(text)
@@ -135,14 +141,14 @@ def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[Runs, i
     return found, missing
 
 
-def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> str:
-    """Figure, table and claims of a study as Markdown; writes the figure and its data."""
+def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> tuple[str, list[str]]:
+    """Figure, table and claims of a study as Markdown, and the claims' lines; writes the figure and its data."""
     experiment = study.name if settings.size == "small" else f"paper/{study.name}"
     lines = [f"`python train.py -m experiment={experiment}`"]
     if missing:
         lines[0] += f" (runs that have not been made yet: {missing} of {missing + len(found)})"
     if not found:
-        return lines[0]
+        return lines[0], []
     beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]
     tasks = rows_of_study(study, found, beside)
     folder = Path(settings.out).with_suffix("")
@@ -163,8 +169,8 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
                 row = f"{title}: " if claim.row else ""
                 verdicts.append(f"| {row}{verdict.claim} | {verdict.outcome} | {verdict.measured} |")
     if verdicts:
-        lines += ["", "| claim (of greedy play at the end) | | measured |", "|---|---|---|", *verdicts]
-    return "\n".join(lines)
+        lines += ["", CLAIMS, *verdicts]
+    return "\n".join(lines), verdicts
 
 
 def rows_of_study(study: Study, found: Runs, beside: Runs) -> list[tuple[str, dict[str, list[Found]]]]:

@@ -25,7 +25,7 @@ class Verdict:
 
     claim: str
     outcome: str
-    """``agrees``, ``disagrees``, or ``open`` where the seeds do not tell."""
+    """``agrees``, ``disagrees``, or ``open`` where the seeds do not tell; says if there is but one seed."""
     measured: str
 
 
@@ -87,7 +87,7 @@ class Ordered:
                     lows.append(low)
                     highs.append(high)
         outcome = AGREES if min(lows) > 0 else DISAGREES if min(highs) < 0 else OPEN
-        return Verdict(" above ".join(map(" and ".join, levels)), outcome, _means(names, values))
+        return _verdict(" above ".join(map(" and ".join, levels)), outcome, names, values)
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Alike:
 
     Examples:
         >>> Alike("return", ["a", "b"]).check({"return": {"a": np.array([1.6]), "b": np.array([1.65])}}).outcome
-        'agrees'
+        'agrees (one seed)'
     """
 
     quantity: str
@@ -112,7 +112,7 @@ class Alike:
         mean, low, high = difference(first, second)
         apart = low > self.within or high < -self.within
         outcome = DISAGREES if apart else AGREES if abs(mean) <= self.within else OPEN
-        return Verdict(" and ".join(self.groups) + " alike", outcome, _means(self.groups, values))
+        return _verdict(" and ".join(self.groups) + " alike", outcome, self.groups, values)
 
 
 @dataclass(frozen=True)
@@ -136,8 +136,10 @@ class Near:
             return None
         near = abs(values[self.group].mean() - self.value) <= self.within
         claim = f"{self.group} takes about {self.value:g} {self.quantity}"
-        return Verdict(claim, AGREES if near else DISAGREES, _means([self.group], values))
+        return _verdict(claim, AGREES if near else DISAGREES, [self.group], values)
 
 
-def _means(names: Sequence[str], values: Mapping[str, Array]) -> str:
-    return ", ".join(f"{name} {values[name].mean():.3g}" for name in names)
+def _verdict(claim: str, outcome: str, names: Sequence[str], values: Mapping[str, Array]) -> Verdict:
+    one_seed = min(len(values[name]) for name in names) == 1
+    measured = ", ".join(f"{name} {values[name].mean():.3g}" for name in names)
+    return Verdict(claim, f"{outcome} (one seed)" if one_seed else outcome, measured)

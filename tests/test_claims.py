@@ -21,7 +21,7 @@ def test_order_of_two(a, b, outcome):
 
 
 def test_groups_of_one_level_are_not_compared():
-    values = results(a=[3.0], b=[1.0], c=[1.5])
+    values = results(a=[3.0, 3.0], b=[1.0, 1.0], c=[1.5, 1.5])
     assert Ordered("return", ["a", ["b", "c"]]).check(values).outcome == "agrees"
     assert Ordered("return", ["a", "b", "c"]).check(values).outcome == "disagrees"  # though its first pair holds
     assert Ordered("return", ["c", ["b", "a"]]).check(values).claim == "c above b and a"
@@ -29,7 +29,7 @@ def test_groups_of_one_level_are_not_compared():
 
 @pytest.mark.parametrize(
     ("a", "b", "outcome"),
-    [([1.0, 1.1], [1.0, 1.15], "agrees"), ([1.0], [2.0], "disagrees"), ([0.5, 1.5], [0.8], "open")],
+    [([1.0, 1.1], [1.0, 1.15], "agrees"), ([1.0, 1.0], [2.0, 2.0], "disagrees"), ([0.5, 1.5], [0.8, 0.8], "open")],
 )
 def test_alike(a, b, outcome):
     assert Alike("return", ["a", "b"]).check(results(a=a, b=b)).outcome == outcome
@@ -37,8 +37,12 @@ def test_alike(a, b, outcome):
 
 @pytest.mark.parametrize(("value", "outcome"), [(1.2, "agrees"), (1.9, "disagrees")])
 def test_near(value, outcome):
-    verdict = Near("return", "a", 1.0, within=0.5).check(results(a=[value]))
+    verdict = Near("return", "a", 1.0, within=0.5).check(results(a=[value, value]))
     assert (verdict.outcome, verdict.claim) == (outcome, "a takes about 1 return")
+
+
+def test_one_seed_is_said():
+    assert Ordered("return", ["a", "b"]).check(results(a=[2.0, 2.0], b=[1.0])).outcome == "agrees (one seed)"
 
 
 @pytest.mark.parametrize(
