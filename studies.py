@@ -94,6 +94,11 @@ STUDIES = (
         beside=("v3",),
     ),
     Study(
+        "authors_choices_3_goals",
+        "The same with three goals: what the meta level feels",
+        by=("variant",),
+    ),
+    Study(
         "tuning_flat",
         "Search for the settings of DQN and DRQN",
         by=("algo.learner.learning_rate", "algo.learner.tau"),
