@@ -5,7 +5,7 @@
 
 runs      folders, glob patterns or archives (.tar.xz) that an earlier report kept, several in brackets; a run belongs
           to a study if it has the settings of one of its jobs, wherever it lies
-out       text to write; its figures and tables go to a folder of the same name. What stands in it outside of the
+out       text to write; its figures go to a folder of the same name. What stands in it outside of the
           marked parts is left as it is
 size      small (default) or paper: which of a study's two sizes
 studies   only these: studies=gridworld,views; without it there is also an overview of all claims
@@ -24,11 +24,12 @@ from typing import Any
 
 import yaml
 from omegaconf import MISSING
+from PIL import Image
 
 from configuration import SettingsError, command_line
 from hdrqn_torchrl.claims import Results
 from hdrqn_torchrl.comparison import GREEDY, PAPER, plot_curves
-from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
+from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals
 from hdrqn_torchrl.grouping import Entry, value_of
 from hdrqn_torchrl.results import final_value
 from plot import YAML_LOADER, as_list, common_references, read_entries
@@ -142,7 +143,7 @@ def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[Runs, i
 
 
 def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> tuple[str, list[str]]:
-    """Figure, table and claims of a study as Markdown, and the claims' lines; writes the figure and its data."""
+    """Figure, table and claims of a study as Markdown, and the claims' lines; draws its figures."""
     experiment = study.name if settings.size == "small" else f"paper/{study.name}"
     lines = [f"`python train.py -m experiment={experiment}`"]
     if missing:
@@ -151,14 +152,9 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
         return lines[0], []
     beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]
     tasks = rows_of_study(study, found, beside)
-    folder = Path(settings.out).with_suffix("")
-    name = study.name if settings.size == "small" else f"{study.name}_paper"
-    curves = [sum_up(title, groups) for title, groups in tasks]
-    plot_curves(curves, [folder / f"{name}.png"], panels=PAPER, axis="episodes")
-    plot_curves(curves, [folder / f"{name}_greedy.png"], panels=GREEDY, axis="episodes")
-    write_table(folder / f"{name}.csv", curves, axis="episodes")
-    lines += ["", f"![{study.title}: while training]({folder.name}/{name}.png)"]
-    lines += ["", f"![{study.title}: greedy play]({folder.name}/{name}_greedy.png)"]
+    if study.figures:
+        name = study.name if settings.size == "small" else f"{study.name}_paper"
+        lines += figures(study.title, Path(settings.out).with_suffix("") / name, tasks)
     for title, groups in tasks:
         lines += ["", f"**{title}**", "", HEADER] if len(tasks) > 1 else ["", HEADER]
         lines += [table_row(label, members) for label, members in groups.items()]
@@ -171,6 +167,20 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
     if verdicts:
         lines += ["", CLAIMS, *verdicts]
     return "\n".join(lines), verdicts
+
+
+def figures(title: str, path: Path, tasks: list[tuple[str, dict[str, list[Found]]]]) -> list[str]:
+    """Draws a study while training and in greedy play; lines that show both."""
+    curves = [sum_up(row, groups) for row, groups in tasks]
+    lines = []
+    for when, ending, panels in (("while training", "", PAPER), ("greedy play", "_greedy", GREEDY)):
+        picture = path.with_name(f"{path.name}{ending}.png")
+        plot_curves(curves, [picture], panels=panels, axis="episodes")
+        with Image.open(picture) as image:
+            few_colours = image.convert("P", palette=Image.Palette.ADAPTIVE)
+        few_colours.save(picture, optimize=True)  # a third of the size
+        lines += ["", f"![{title}: {when}]({path.parent.name}/{picture.name})"]
+    return lines
 
 
 def rows_of_study(study: Study, found: Runs, beside: Runs) -> list[tuple[str, dict[str, list[Found]]]]:

@@ -42,6 +42,7 @@ class Study:
     claims: tuple[Claim, ...] = ()
     sizes: tuple[str, ...] = ("small", "paper")
     """In which it exists."""
+    figures: bool = True
 
 
 STUDIES = (
@@ -104,6 +105,7 @@ STUDIES = (
         by=("algo.learner.learning_rate", "algo.learner.tau"),
         rows="algo",
         sizes=("small",),
+        figures=False,
     ),
     Study(
         "tuning_hierarchical",
@@ -111,6 +113,7 @@ STUDIES = (
         by=("algo.sub.learning_rate", "algo.sub.tau"),
         rows="algo",
         sizes=("small",),
+        figures=False,
     ),
 )
 
