@@ -14,6 +14,9 @@ from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
 
 
+_USUAL_VIEW = 5
+
+
 class Features(nn.Module):
     """A feature extractor: it tells how many features it makes."""
 
@@ -97,6 +100,10 @@ class ConvFeatures(Features):
 class CellFeatures(Features):
     """Cell codes as one-hot vectors through small dense layers: the same information as the image, cheaply.
 
+    Every cell of a window has a weight in each unit, and Adam changes all of them by the learning rate at once: the
+    larger the window, the larger the step. Windows of more than 5x5 cells are therefore scaled down, and their first
+    weights begin as much larger; a learning rate then does the same for every view.
+
     Args:
         view: side of the window in cells.
         num_codes: number of cell codes.
@@ -114,8 +121,11 @@ class CellFeatures(Features):
 
     def __init__(self, view: int, num_codes: int, widths: tuple[int, ...] = (128,)) -> None:
         super().__init__()
-        self.register_buffer("_one_hot", torch.eye(num_codes), persistent=False)
+        scale = min(1.0, (_USUAL_VIEW / view) ** 2)
+        self.register_buffer("_one_hot", torch.eye(num_codes) * scale, persistent=False)
         self.dense = _dense_layers(view * view * num_codes, widths)
+        with torch.no_grad():
+            self.dense[0].weight /= scale
         self.out_features = widths[-1]
 
     def forward(self, cells: Tensor) -> Tensor:

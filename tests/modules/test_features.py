@@ -74,6 +74,25 @@ class TestVectors:
         assert features(cells).shape == (2, 7, 4) and features.out_features == 4
         torch.testing.assert_close(features(cells)[1, 6], features(cells[1, 6]))
 
+    @pytest.mark.parametrize(("view", "like_5x5"), [(3, 9 / 25), (5, 1.0), (19, 1.0)])
+    def test_one_step_of_adam_does_the_same_whatever_the_view(self, view, like_5x5):
+        """A larger window would move by so much more; whole maps were hardly learned because of it."""
+        torch.manual_seed(0)
+        moved = []
+        for side in (view, 5):
+            features = CellFeatures(side, num_codes=5, widths=(64,))
+            cells = torch.randint(5, (side, side), dtype=torch.uint8)
+            before = features.dense[0](features._one_hot[cells.int()].flatten())
+            assert before.std() == pytest.approx(0.26, abs=0.06)
+            features(cells).sum().backward()
+            active = features.dense[0].weight.grad != 0
+            with torch.no_grad():
+                features.dense[0].weight += 1e-3 * active
+            on = active.any(1)
+            after = features.dense[0](features._one_hot[cells.int()].flatten())
+            moved.append((after - before)[on].mean().item())
+        assert moved[0] / moved[1] == pytest.approx(like_5x5, rel=1e-2)
+
     def test_fully_connected_features_are_the_papers_four_layers(self):
         features = FullyConnectedFeatures(10)
         shapes = [tuple(p.shape) for p in features.parameters() if p.ndim == 2]
