@@ -13,7 +13,6 @@ from torch.nn.functional import embedding
 from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
 
-
 _USUAL_VIEW = 5
 
 
@@ -125,7 +124,7 @@ class CellFeatures(Features):
         self.register_buffer("_one_hot", torch.eye(num_codes) * scale, persistent=False)
         self.dense = _dense_layers(view * view * num_codes, widths)
         with torch.no_grad():
-            self.dense[0].weight /= scale
+            next(self.dense.parameters()).div_(scale)
         self.out_features = widths[-1]
 
     def forward(self, cells: Tensor) -> Tensor:
