@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 ALLOWED_TARGETS = (
     "hdrqn_torchrl.envs.MultiGoalGridEnv",
+    "hdrqn_torchrl.envs.make_montezuma",
     "hdrqn_torchrl.algorithms.make_dqn",
     "hdrqn_torchrl.algorithms.make_drqn",
     "hdrqn_torchrl.algorithms.make_hdqn",
@@ -34,8 +35,10 @@ ALLOWED_TARGETS = (
     "hdrqn_torchrl.learner.LearnerSettings",
     "hdrqn_torchrl.modules.EpsilonGreedy",
     "hdrqn_torchrl.modules.RepeatingEpsilonGreedy",
+    "hdrqn_torchrl.modules.SuccessEpsilonGreedy",
     "hdrqn_torchrl.modules.compact_network",
     "hdrqn_torchrl.modules.paper_network",
+    "hdrqn_torchrl.phases.PhaseOne",
     "hdrqn_torchrl.logging.make_tensorboard_logger",
     "hdrqn_torchrl.logging.make_wandb_logger",
     "hdrqn_torchrl.logging.make_mlflow_logger",
@@ -52,6 +55,7 @@ class EvaluationSchema:
     interval_frames: int = MISSING
     final_episodes: int = MISSING
     seed: int = MISSING
+    env: dict[str, Any] = field(default_factory=dict)  # settings of the environment that differ in evaluations
 
 
 @dataclass
@@ -257,7 +261,7 @@ def load_agent(
 
     folder = Path(run)
     config = read_config(folder)
-    for key, value in (env_changes or {}).items():
+    for key, value in {**config.evaluation.env, **(env_changes or {})}.items():
         if key.startswith("_") or key not in config.env:
             raise SettingsError(f"env.{key} must be one of {sorted(set(config.env) - {'_target_'})}; it is none.")
         config.env[key] = value

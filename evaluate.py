@@ -10,6 +10,8 @@
     epsilon         probability of a random choice, at each level (0: greedy)
     env.KEY         setting of the task that shall differ from the run's, e.g. env.view=3 env.layout=four_rooms
     out             file to write the object to as well
+    figures         folder for pictures: how often options lead from one subgoal to another (legs.png) and, where
+                    there is a screen, where the agent was (places.png)
     allowed_targets own builders that the run's settings may name, e.g. [my_package.MyEnv]
 
 Each figure is a mean over episodes; "intervals" are 95 % bootstrap intervals, "references" what scripted players
@@ -21,11 +23,16 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import MISSING, OmegaConf
 
 from configuration import SettingsError, command_line, load_agent
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from hdrqn_torchrl.legs import LegCounter
 
 
 @dataclass
@@ -40,6 +47,7 @@ class Settings:
     epsilon: float = 0.0
     env: dict[str, Any] = field(default_factory=dict)
     out: str | None = None
+    figures: str | None = None
     threads: int = 1
     allowed_targets: list[str] = field(default_factory=list)
 
@@ -79,13 +87,17 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
     for exploration in agent.algorithm.explorations.values():
         exploration.epsilon.fill_(settings.epsilon)
     greedy = settings.epsilon == 0.0
+    observers = observers_of(agent.env)
     played = play(
         agent.env,
         agent.algorithm.policy,
         episodes=settings.episodes,
         seed=settings.seed,
         exploration_type=ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM,
+        observers=list(observers.values()),
     )
+    if settings.figures is not None:
+        draw(observers, agent.env.base_env, Path(settings.figures))
     references = references_for(agent.env.base_env)
     return {
         "run": settings.run,
@@ -94,9 +106,43 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
         "seed": settings.seed,
         "epsilon": settings.epsilon,
         **summarise(played),
+        **({"legs": legs_of(observers["legs"])} if "legs" in observers else {}),
         "ceiling": ceiling_of(references),
         "references": references,
     }
+
+
+def observers_of(env: EnvBase) -> dict[str, Any]:
+    """What counts legs (of hierarchical agents) and places (where there is a screen)."""
+    from hdrqn_torchrl import keys
+    from hdrqn_torchrl.evaluation import PlaceCounter
+    from hdrqn_torchrl.legs import LegCounter
+
+    spec, base = env.observation_spec, env.base_env
+    observers: dict[str, Any] = {}
+    if spec.get(keys.OPTION_INIT, None) is not None:
+        observers["legs"] = LegCounter(spec[keys.ATTAINED].shape[-1])
+    if spec.get(keys.POSITION, None) is not None:
+        observers["places"] = PlaceCounter(*base.emulators.screens.shape[1:3])
+    return observers
+
+
+def legs_of(legs: LegCounter) -> dict[str, list]:
+    """Counts ``[G + 1][G]``: from each subgoal, last from the start, to each."""
+    return {"options": legs.options.tolist(), "reached": legs.reached.tolist()}
+
+
+def draw(observers: dict[str, Any], base: EnvBase, folder: Path) -> None:
+    """Writes the pictures."""
+    from hdrqn_torchrl.figures import plot_legs, plot_places
+    from hdrqn_torchrl.rendering import scene_of
+
+    folder.mkdir(parents=True, exist_ok=True)
+    if "legs" in observers:
+        legs = observers["legs"]
+        plot_legs(legs.options.numpy(), legs.reached.numpy(), scene_of(base).subgoal_names, folder / "legs.png")
+    if "places" in observers:
+        plot_places(observers["places"].counts.numpy(), base.emulators.start.screen, folder / "places.png")
 
 
 if __name__ == "__main__":

@@ -151,7 +151,8 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     numpy.random.seed(config.seed)
     torch.manual_seed(config.seed)
     env, algorithm = build_algorithm(config, seed=config.seed, device=device)
-    evaluation_env = algorithm.transform(instantiate(config.env, num_envs=config.evaluation.num_envs, device=device))
+    played = {"num_envs": config.evaluation.num_envs, "device": device, **config.evaluation.env}
+    evaluation_env = algorithm.transform(instantiate(config.env, **played))
     references = references_for(env)
     frames_per_batch = env.batch_size[0] * config.steps_per_batch
     collector = ResumableCollector(

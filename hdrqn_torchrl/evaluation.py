@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy
 import torch
@@ -19,6 +20,41 @@ _SUMMED = {
     "intrinsic": keys.INTRINSIC_REWARD,
     "success": keys.SUCCESS,
 }
+
+
+class Observer(Protocol):
+    """Something that counts what happens."""
+
+    def add_step(self, step: TensorDictBase) -> None:
+        """Takes one step of all environments ``[N]``, its outcome below ``"next"``."""
+        ...
+
+
+class PlaceCounter:
+    """Counts where agents are on a screen: a heat map.
+
+    Args:
+        height, width: of the screen in pixels.
+        cell: side of a cell of the map in pixels.
+
+    Examples:
+        >>> places = PlaceCounter(8, 8, cell=4)
+        >>> after = {"position": torch.tensor([[1.0, 2.0], [7.0, 3.0]])}
+        >>> places.add_step(TensorDict({"next": after}, [2]))
+        >>> places.counts.tolist()
+        [[1, 1], [0, 0]]
+    """
+
+    def __init__(self, height: int, width: int, cell: int = 2) -> None:
+        self.cell = cell
+        self.counts = torch.zeros(-(-height // cell), -(-width // cell), dtype=torch.int64)
+
+    def add_step(self, step: TensorDictBase) -> None:
+        """Reads ``position`` after one step of all environments ``[N]``."""
+        rows, columns = self.counts.shape
+        x, y = (step.get(("next", keys.POSITION)).cpu() / self.cell).long().unbind(-1)
+        index = y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)
+        self.counts.view(-1).index_add_(0, index, torch.ones_like(index))
 
 
 class EpisodeTracker:
@@ -90,6 +126,7 @@ def play(
     episodes: int,
     seed: int = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    observers: Sequence[Observer] = (),
 ) -> TensorDictBase:
     """Plays episodes; the same seed gives the same ones.
 
@@ -102,6 +139,7 @@ def play(
         episodes: number of episodes, rounded up to a multiple of N.
         seed: seed of the environment.
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
+        observers: are shown every step, those after the end of an environment's last episode as well.
 
     Returns:
         One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)``.
@@ -109,7 +147,7 @@ def play(
     env.set_seed(seed)
     with set_exploration_type(exploration_type), torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        rounds = [_play_once(env, policy) for _ in range(-(-episodes // env.batch_size[0]))]
+        rounds = [_play_once(env, policy, observers) for _ in range(-(-episodes // env.batch_size[0]))]
     return torch.cat(rounds, 0)  # type: ignore[return-value]
 
 
@@ -183,7 +221,7 @@ def _interval(values: Tensor, confidence: float) -> list[float]:
     return [result.confidence_interval.low.item(), result.confidence_interval.high.item()]
 
 
-def _play_once(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
+def _play_once(env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[Observer]) -> TensorDictBase:
     """One episode in each environment, ``[N]``."""
     tensordict, tracker = env.reset(), EpisodeTracker(per_subgoal=True)
     playing = torch.ones(env.batch_size, dtype=torch.bool, device=tensordict.device)
@@ -192,6 +230,8 @@ def _play_once(env: EnvBase, policy: TensorDictModuleBase) -> TensorDictBase:
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))
         after = tensordict.get("next")
         sums = tracker.add(after)
+        for observer in observers:
+            observer.add_step(tensordict)
         ended = playing & after.get(keys.DONE).squeeze(-1)
         episodes = sums if episodes is None else torch.where(ended, sums, episodes)
         playing, tensordict = playing & ~ended, following

@@ -11,9 +11,14 @@ OBSERVATION = "observation"  # [V, V] uint8 cell codes, or [3, 44, 44] uint8 pix
 REWARD = "reward"  # [1] float32: total reward of the task
 EXTRINSIC_REWARD = "extrinsic_reward"  # [1] float32: r^ex
 ATTAINED = "attained"  # [G] bool: subgoals reached by this very step
+AVAILABLE = "available"  # [G] bool: subgoals worth choosing now; not every environment has it
 HAZARD = "hazard"  # [1] bool: obstacle hit or life lost in this step
 SUCCESS = "success"  # [1] bool: the whole task was completed by this very step
 IS_INIT = "is_init"  # [1] bool: first step of an episode
+PIXELS, POSITION = (
+    "pixels",
+    "position",
+)  # [height, width, 3] uint8: a whole screen; [2] float32: where the agent is on it
 
 # Written by the policy.
 ACTION = "action"  # [] int64

@@ -213,6 +213,8 @@ class Learner:
             device=self.device,
         )
         self._drawn: list[TensorDictBase] = []
+        self.held = False
+        """Whether it stores only; what it could have learned meanwhile is not made up for."""
         self._warm_at = settings.warmup_frames  # or when the first transition came, if that is later
 
     @property
@@ -237,6 +239,8 @@ class Learner:
             if not len(self.buffer):
                 self._warm_at = max(self._warm_at, self.frames - batch.numel())
             self.buffer.extend(transitions)
+        if self.held:
+            self._warm_at = max(self._warm_at, self.frames)
 
     def updates_due(self) -> int:
         """How many updates are owed for the frames seen so far."""

@@ -70,7 +70,7 @@ class Trainer:
         self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
-        self._tracker, self._window = EpisodeTracker(), _Window()
+        self._tracker, self._window = EpisodeTracker(per_subgoal=algorithm.phases is not None), _Window()
         self._stop = StopRequest()
         self._started = self._saved_at = time.monotonic()
         self._saved_position: tuple | None = None
@@ -131,6 +131,9 @@ class Trainer:
             learner.store(batch)
         for exploration in self.algorithm.explorations.values():
             exploration.step(batch.numel())
+            exploration.observe(batch)
+        if self.algorithm.phases is not None:
+            self.algorithm.phases.observe(batch)
 
     def _complete_iteration(self) -> None:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
@@ -167,6 +170,7 @@ class Trainer:
             **{f"{name}/updates": learner.updates for name, learner in self.algorithm.learners.items()},
             **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
             **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
+            **({} if self.algorithm.phases is None else self.algorithm.phases.metrics()),
         }
         best = False
         if evaluation:
@@ -216,6 +220,7 @@ class Trainer:
             "collector": self.collector,
             **{f"learner-{name}": learner for name, learner in self.algorithm.learners.items()},
             "logger": self.logger,
+            **({} if self.algorithm.phases is None else {"phases": self.algorithm.phases}),
             "policy": self.algorithm.policy,
             "random": GlobalRNGState(),
             "trainer": self,
@@ -299,7 +304,9 @@ class _Window:
         row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
         if self._episodes:
             episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
-            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items()}
+            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items() if value.ndim == 1}
+            if "attained" in episodes:
+                row |= _visits(episodes["attained"])
         for learner, sums in self._sums.items():
             count = self._counts[learner]
             row |= {f"{learner}/{name}": (total / count).item() for name, total in sums.items()}
@@ -318,3 +325,10 @@ class _Window:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self._frames, self._since = state["frames"], time.monotonic() - state["seconds"]
         self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]
+
+
+def _visits(attained: Tensor) -> Row:
+    """Share of episodes ``[M, G]`` that attained each subgoal, and how often they did."""
+    shares, visits = (attained > 0).float().mean(0).tolist(), attained.mean(0).tolist()
+    row: Row = {f"behaviour/attained_{index}": share for index, share in enumerate(shares)}
+    return row | {f"behaviour/visits_{index}": number for index, number in enumerate(visits)}

@@ -64,6 +64,17 @@ def test_epsilon_and_the_task_can_be_changed(call):
     assert longer["ceiling"] > random["ceiling"]
 
 
+def test_legs_and_their_picture(call, tmp_path):
+    result = call("episodes=32", "num_envs=16", "epsilon=0.5", f"figures={tmp_path}/figures")
+    options, reached = result["legs"]["options"], result["legs"]["reached"]
+    assert len(options) == 3 and all(
+        len(row) == 2 for row in options
+    )  # from each goal and from the start, to each goal
+    assert sum(map(sum, options)) >= 32
+    assert all(r <= o for row, told in zip(reached, options, strict=True) for r, o in zip(row, told, strict=True))
+    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["legs.png"]
+
+
 def test_the_object_can_be_written_to_a_file(call, tmp_path):
     result = call("episodes=8", f"out={tmp_path / 'result.json'}")
     assert json.loads((tmp_path / "result.json").read_text()) == result

@@ -1,10 +1,11 @@
 import pytest
 import torch
 from helpers import RIGHT, build, collect, small_env, subgoal_env
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from hdrqn_torchrl.evaluation import EpisodeTracker, evaluate, play, summarise
+from hdrqn_torchrl.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, summarise
 
 PAIR = ("####", "#  #", "####")  # agent and goal side by side
 TRACKED = ("return", "extrinsic", "intrinsic", "success", "in_order", "steps")
@@ -172,3 +173,23 @@ class TestIntervals:
     def test_constant_figures_have_a_point(self):
         summary = summarise(play(pair_env(4), always_right(), episodes=4))
         assert summary["intervals"]["intrinsic_mean"] == [0.0, 0.0]
+
+
+def test_observers_see_every_step():
+    class Steps:
+        count = 0
+
+        def add_step(self, step):
+            self.count += step.numel()
+            assert step["next", "done"].shape == (4, 1)
+
+    steps = Steps()
+    play(pair_env(4), always_right(), episodes=8, observers=[steps])
+    assert steps.count >= 8 and steps.count % 4 == 0
+
+
+def test_places_beyond_the_screen_count_at_its_edge():
+    places = PlaceCounter(5, 6, cell=2)  # 3 rows of 3
+    position = torch.tensor([[0.0, 0.0], [-3.0, 1.9], [99.0, 4.0], [3.0, 99.0]])
+    places.add_step(TensorDict({"next": {"position": position}}, [4]))
+    assert places.counts.tolist() == [[2, 0, 0], [0, 0, 0], [0, 1, 1]]

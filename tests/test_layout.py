@@ -8,9 +8,10 @@ import pytest
 import hdrqn_torchrl
 
 ORDER = (
-    "keys", "devices", "envs", "transforms", "modules", "objectives", "data", "collectors", "precision", "finite",
-    "learner", "algorithms", "evaluation", "serialization", "checkpoint", "interruption", "logging", "results",
-    "estimates", "claims", "grouping", "plotting", "rendering", "comparison", "trainer", "run_folder",
+    "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "collectors", "precision", "finite",
+    "learner",
+    "legs", "phases", "algorithms", "evaluation", "serialization", "checkpoint", "interruption", "logging", "results",
+    "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

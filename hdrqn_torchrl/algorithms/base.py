@@ -10,9 +10,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, TransformedEnv
 
+from hdrqn_torchrl import keys
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
+from hdrqn_torchrl.phases import Phases
 
 Controller = SubController | MetaController | AllSubgoalsPolicy
 
@@ -25,10 +27,11 @@ class Algorithm:
     learners: dict[str, Learner]
     explorations: dict[str, EpsilonGreedy]
     make_transforms: Callable[[], Compose]
+    phases: Phases | None = None
 
     def transform(self, env: EnvBase) -> TransformedEnv:
         """The environment as this algorithm sees it."""
-        return TransformedEnv(env, self.make_transforms())
+        return TransformedEnv(env, self.make_transforms(), auto_unwrap=True)
 
 
 def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:
@@ -78,3 +81,8 @@ def make_recurrent_loss(
     )
     loss.set_keys(**(loss_keys or {}))
     return loss
+
+
+def available_key(env: EnvBase) -> NestedKey | None:
+    """The entry in which an environment says which subgoals are worth choosing, if it does."""
+    return None if env.observation_spec.get(keys.AVAILABLE, None) is None else keys.AVAILABLE

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, available_key, make_recurrent_loss, stored_states
 from hdrqn_torchrl.data import (
     FROM_STARTS,
     HindsightOptions,
@@ -24,6 +24,7 @@ from hdrqn_torchrl.data import (
 )
 from hdrqn_torchrl.learner import Extract, Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 
@@ -36,6 +37,7 @@ def make_hdrqn(
     meta: LearnerSettings = LearnerSettings(slice_len=1, capacity=50_000),  # noqa: B008
     sub_exploration: EpsilonGreedy | None = None,
     meta_exploration: EpsilonGreedy | None = None,
+    phase_one: PhaseOne | None = None,
     gamma: float = 0.99,
     smdp_discount: bool = True,
     meta_input: Literal["hidden", "cell", "both"] = "hidden",
@@ -60,6 +62,7 @@ def make_hdrqn(
         version: what the meta-controller reads: ``"v1"`` the observation, ``"v2"`` the sub-controller's state.
         sub, meta: how each level learns.
         sub_exploration, meta_exploration: their schedules.
+        phase_one: how long the sub level learns alone, with subgoals at random; ``None``: both learn from the start.
         gamma: discount of one step.
         smdp_discount: discount the option's return inside the option and what follows by :math:`\gamma^k`;
             ``False``: plain sum and :math:`\gamma`.
@@ -69,7 +72,8 @@ def make_hdrqn(
             steps, they are computed anew from the stored observations after options of up to so many steps (the step
             limit of an episode covers all). ``None`` keeps them as stored, like the paper.
         mask_reached: let the meta-controller choose only among subgoals not yet attained.
-        repeatable_subgoals: whether subgoals can be attained again (then nothing is masked).
+        repeatable_subgoals: whether subgoals can be attained again (then nothing is masked). Neither is asked of an
+            environment that says itself what is worth choosing (``available``).
         wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one.
         hazard_reward: intrinsic reward for meeting the hazard.
         max_option_steps: step limit of an option.
@@ -118,7 +122,10 @@ def make_hdrqn(
     sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
     observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
     num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
-    mask_key = keys.SUBGOAL_MASK if mask_reached and not repeatable_subgoals else None
+    available = available_key(env)
+    masked = available is not None or (mask_reached and not repeatable_subgoals)
+    mask_key = keys.SUBGOAL_MASK if masked else None
+    sub_exploration.set_num_subgoals(num_subgoals)
     meta_keys = _meta_input_keys(meta_input) if version == "v2" else [keys.OBSERVATION]
     meta_inputs = len(meta_keys) * architecture.hidden_size if version == "v2" else observation
 
@@ -218,6 +225,7 @@ def make_hdrqn(
             hazard_reward=hazard_reward,
             wrong_subgoal_reward=wrong_subgoal_reward,
             repeatable=repeatable_subgoals,
+            available_key=available,
         )
         primers = [controller.make_tensordict_primer() for controller in (sub_controller, meta_controller)]
         return Compose(InitTracker(), subgoals, *primers)
@@ -227,6 +235,7 @@ def make_hdrqn(
         learners={"sub": sub_learner, "meta": meta_learner},
         explorations={"sub": sub_exploration, "meta": meta_exploration},
         make_transforms=make_transforms,
+        phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, meta_learner),
     )
 
 

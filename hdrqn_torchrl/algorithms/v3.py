@@ -6,7 +6,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, available_key, stored_states
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import (
@@ -18,6 +18,7 @@ from hdrqn_torchrl.modules import (
     observation_predictor,
 )
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
+from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 V3_LEARNER = LearnerSettings(
@@ -40,6 +41,7 @@ def make_v3(
     learner: LearnerSettings = V3_LEARNER,
     sub_exploration: EpsilonGreedy | None = None,
     meta_exploration: EpsilonGreedy | None = None,
+    phase_one: PhaseOne | None = None,
     memory_size: int = 128,
     head_size: int = 128,
     joint: bool = True,
@@ -64,6 +66,8 @@ def make_v3(
         learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
             should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
+        phase_one: how long subgoals are chosen at random (the meta level learns meanwhile, as its head learns from
+            every step); ``None``: not at all.
         memory_size: H, size of the LSTM.
         head_size: units of the heads' hidden layers.
         joint: whether the meta level trains the memory, too; ``False``: it reads the memory only, and its head has an
@@ -118,6 +122,7 @@ def make_v3(
         predictor=predictor,
     )
     sub_exploration, meta_exploration = sub_exploration or RepeatingEpsilonGreedy(), meta_exploration or EpsilonGreedy()
+    sub_exploration.set_num_subgoals(num_subgoals)
     policy = AllSubgoalsPolicy(network, sub_exploration, meta_exploration).to(env.device)
     loss = AllSubgoalsLoss(
         policy,
@@ -165,6 +170,7 @@ def make_v3(
             max_option_steps=max_option_steps,
             hazard_reward=hazard_reward,
             wrong_subgoal_reward=wrong_subgoal_reward,
+            available_key=available_key(env),
         )
         return Compose(InitTracker(), subgoals, policy.make_tensordict_primer())
 
@@ -173,4 +179,5 @@ def make_v3(
         learners={"joint": trained},
         explorations={"sub": sub_exploration, "meta": meta_exploration},
         make_transforms=make_transforms,
+        phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, None),
     )

@@ -2,6 +2,7 @@
 
 from hdrqn_torchrl.envs.ceilings import ceiling
 from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
+from hdrqn_torchrl.envs.montezuma import MontezumaEnv, make_montezuma
 from hdrqn_torchrl.envs.scripted import (
     EgocentricSearch,
     FullInformationPlanner,
@@ -14,10 +15,12 @@ from hdrqn_torchrl.envs.scripted import (
 __all__ = [
     "EgocentricSearch",
     "FullInformationPlanner",
+    "MontezumaEnv",
     "MultiGoalGridEnv",
     "PerfectMemorySearch",
     "UniformRandom",
     "ceiling",
+    "make_montezuma",
     "play_episodes",
     "scripted_ceiling",
 ]

@@ -7,6 +7,7 @@ from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGre
 from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
 from hdrqn_torchrl.modules.prediction import CellDecoder, ImageDecoder, ObservationPredictor
 from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
+from hdrqn_torchrl.modules.success import SubgoalSuccess, SuccessEpsilonGreedy
 
 __all__ = [
     "AllSubgoalsNetwork",
@@ -26,6 +27,8 @@ __all__ = [
     "QNetwork",
     "RepeatingEpsilonGreedy",
     "SubController",
+    "SubgoalSuccess",
+    "SuccessEpsilonGreedy",
     "compact_network",
     "observation_predictor",
     "paper_network",

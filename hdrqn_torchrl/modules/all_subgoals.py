@@ -235,7 +235,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         chosen = self.meta_exploration(subgoal_value, mask)
         subgoal = torch.where(starts, chosen, tensordict.get(self.active_subgoal_key))
         wanted = values_of(action_value, subgoal)
-        action = choose_action(self.sub_exploration, wanted, tensordict, self.repeated_action_key)
+        action = choose_action(self.sub_exploration, wanted, tensordict, self.repeated_action_key, subgoal)
         tensordict.set(self.subgoal_key, subgoal).set(self.action_key, action)
         for key, value in ((self.hidden_key, hidden), (self.cell_key, cell), (self.previous_action_key, action)):
             tensordict.set(_next(key), value)

@@ -111,7 +111,8 @@ class SubController(TensorDictModuleBase):
         return tensordict.set(_next(self.cell_key), cell)
 
     def _choose(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
-        return choose_action(self.exploration, value, tensordict, self.repeated_action_key)
+        subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
+        return choose_action(self.exploration, value, tensordict, self.repeated_action_key, subgoal)
 
     def advance(self, tensordict: TensorDictBase, subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL) -> State:
         """LSTM state after one more observation, without a decision.

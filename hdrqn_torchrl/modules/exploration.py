@@ -52,15 +52,30 @@ class EpsilonGreedy(nn.Module):
         self.start, self.end, self.anneal_frames, self.ladder = start, end, anneal_frames, ladder
         self.register_buffer("frames", torch.zeros((), dtype=torch.int64))
         self.register_buffer("epsilon", torch.tensor(float(start)))
+        self.held = False
+        """Whether the schedule stands still."""
 
     def step(self, frames: int) -> None:
-        """Advances the schedule by ``frames`` environment frames."""
+        """Advances the schedule by ``frames`` environment frames, unless it is held."""
+        if self.held:
+            return
         self.frames += frames
         progress = (self.frames / self.anneal_frames).clamp(max=1.0)
         self.epsilon.copy_(self.start + (self.end - self.start) * progress)
 
-    def forward(self, action_value: Tensor, mask: Tensor | None = None) -> Tensor:
+    def set_num_subgoals(self, num_subgoals: int) -> None:
+        """Tells how many subgoals the task has; here they make no difference."""
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Takes note of a collected batch ``[N, T]``; here there is nothing to note."""
+
+    def forward(self, action_value: Tensor, mask: Tensor | None = None, subgoal: Tensor | None = None) -> Tensor:
         """Chooses among ``action_value`` ``[*, A]`` where ``mask`` ``[*, A]`` allows (anywhere if it allows nothing).
+
+        Args:
+            action_value: Q-values.
+            mask: what may be chosen.
+            subgoal: the subgoal ``[*]`` that an action is chosen for.
 
         Returns:
             The choice ``[*]`` int64.
@@ -71,11 +86,11 @@ class EpsilonGreedy(nn.Module):
         if exploration_type() != ExplorationType.RANDOM:
             return greedy
         random = _random_choice(action_value, mask)
-        explores = torch.rand(greedy.shape, device=greedy.device) < self.epsilons(greedy)
+        explores = torch.rand(greedy.shape, device=greedy.device) < self.epsilons(greedy, subgoal)
         return torch.where(explores, random, greedy)
 
-    def epsilons(self, like: Tensor) -> Tensor:
-        """Epsilon of each environment, to be broadcast against choices ``[N, *]``.
+    def epsilons(self, like: Tensor, subgoal: Tensor | None = None) -> Tensor:
+        """Epsilon of each environment, to be broadcast against choices ``[N, *]``; here the same for all subgoals.
 
         With a ladder, environment i has :math:`\\epsilon^{1 + \\alpha i / (N - 1)}` (Ape-X, Horgan et al., 2018).
         """
@@ -125,12 +140,13 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         self.register_buffer("_durations", durations / durations.sum(), persistent=False)
         self._mean_duration = (torch.arange(1, max_repeats + 1) * self._durations).sum().item()
 
-    def extend(self, action_value: Tensor, carried: Tensor) -> tuple[Tensor, Tensor]:
+    def extend(self, action_value: Tensor, carried: Tensor, subgoal: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Chooses, given the stretch in progress.
 
         Args:
             action_value: Q-values ``[*, A]``.
             carried: random action in progress and the steps that it still lasts, ``[*, 2]`` int64.
+            subgoal: the subgoal ``[*]`` that an action is chosen for.
 
         Returns:
             The choice ``[*]`` int64, and what to carry to the next step.
@@ -139,7 +155,7 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         if exploration_type() != ExplorationType.RANDOM:
             return greedy, torch.zeros_like(carried)
         action, left = carried.unbind(-1)
-        share = self.epsilons(greedy)
+        share = self.epsilons(greedy, subgoal)
         begins = share / (share + (1.0 - share) * self._mean_duration)  # so that `share` of all steps are random
         begins = (left == 0) & (torch.rand(greedy.shape, device=greedy.device) < begins)
         durations = torch.multinomial(self._durations, greedy.numel(), replacement=True).view_as(greedy) + 1
@@ -150,7 +166,11 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
 
 
 def choose_action(
-    exploration: EpsilonGreedy, action_value: Tensor, tensordict: TensorDictBase, repeated_action_key: NestedKey
+    exploration: EpsilonGreedy,
+    action_value: Tensor,
+    tensordict: TensorDictBase,
+    repeated_action_key: NestedKey,
+    subgoal: Tensor | None = None,
 ) -> Tensor:
     """The choice of a policy in ``tensordict``, which carries the random stretch in progress, if there can be one.
 
@@ -159,13 +179,14 @@ def choose_action(
         action_value: Q-values ``[*, A]``.
         tensordict: a :class:`RepeatingEpsilonGreedy` reads ``repeated_action_key`` and writes it under ``"next"``.
         repeated_action_key: ``[*, 2]`` int64.
+        subgoal: the subgoal ``[*]`` that the action is chosen for.
 
     Returns:
         ``[*]`` int64.
     """
     if not isinstance(exploration, RepeatingEpsilonGreedy):
-        return exploration(action_value)
-    action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key))
+        return exploration(action_value, subgoal=subgoal)
+    action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key), subgoal)
     tensordict.set(unravel_key(("next", repeated_action_key)), carried)
     return action
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import embedding
+from torch.nn import functional
 
 from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
@@ -48,7 +48,7 @@ class CellsToImage(nn.Module):
 
     def forward(self, cells: Tensor) -> Tensor:
         colours = self._colours.to(autocast_dtype(self._colours))
-        small = embedding(cells.int(), colours)  # [*, view, view, 3]
+        small = functional.embedding(cells.int(), colours)  # [*, view, view, 3]
         return small.index_select(-2, self._cells).index_select(-3, self._cells).movedim(-1, -3)
 
 
@@ -85,14 +85,17 @@ class ConvFeatures(Features):
             previous, side = width, (side - kernel) // stride + 1
         if side < 1:
             raise ValueError(f"size must be >= 33 pixels for four convolutions, got {size}; the paper uses 44.")
-        self.convolutions = nn.Sequential(*layers)
+        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # as oneDNN and cuDNN like it
         self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU(inplace=True))
         self.out_features = out_features
 
     def forward(self, image: Tensor) -> Tensor:
-        if image.dtype == torch.uint8:
-            image = image.float() / 255
-        features = self.dense(self.convolutions(image.reshape(-1, *image.shape[-3:])))
+        images = image.reshape(-1, *image.shape[-3:]).to(memory_format=torch.channels_last)
+        first, others = self.convolutions[0], self.convolutions[1:]
+        weight = first.weight
+        if images.dtype == torch.uint8:  # bfloat16 holds bytes exactly, and there are fewer weights to scale than pixels
+            images, weight = images.to(autocast_dtype(images) or weight.dtype), weight / 255
+        features = self.dense(others(functional.conv2d(images, weight, first.bias, first.stride)))
         return features.view(*image.shape[:-3], self.out_features)
 
 
@@ -129,7 +132,7 @@ class CellFeatures(Features):
 
     def forward(self, cells: Tensor) -> Tensor:
         one_hot = self._one_hot.to(autocast_dtype(self._one_hot))
-        return _on_rows(self.dense, embedding(cells.flatten(-2).int(), one_hot).flatten(-2))
+        return _on_rows(self.dense, functional.embedding(cells.flatten(-2).int(), one_hot).flatten(-2))
 
 
 class FullyConnectedFeatures(Features):

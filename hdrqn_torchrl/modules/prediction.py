@@ -75,8 +75,10 @@ class ImageDecoder(Decoder):
         self.size = size
 
     def error(self, vector: Tensor, observation: Tensor) -> Tensor:
-        image = observation.float() / 255 if observation.dtype == torch.uint8 else observation
-        coarse = functional.adaptive_avg_pool2d(image.reshape(-1, *image.shape[-3:]), self.size)
+        images = observation.reshape(-1, *observation.shape[-3:]).float()
+        coarse = functional.adaptive_avg_pool2d(images, self.size)
+        if observation.dtype == torch.uint8:
+            coarse /= 255
         guess = self.pixels(vector).float().flatten(0, -2)
         return (guess - coarse.flatten(1)).square().mean(-1).view(vector.shape[:-1])
 

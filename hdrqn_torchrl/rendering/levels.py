@@ -9,7 +9,7 @@ from statistics import median
 from typing import NamedTuple
 
 from hdrqn_torchrl.rendering.episodes import Decision, Frame
-from hdrqn_torchrl.rendering.scenes import Colour
+from hdrqn_torchrl.rendering.style import Colour
 
 ACTION_COLOUR = (32, 32, 32)
 

@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw
 
 from hdrqn_torchrl.rendering.episodes import Frame
 from hdrqn_torchrl.rendering.levels import BarSpans, Level, caption, levels_of
-from hdrqn_torchrl.rendering.scenes import font
+from hdrqn_torchrl.rendering.style import font
 
 WIDTH, HEIGHT = 760, 456  # even, as video codecs want it
 _MARGIN, _TOP, _WORLD, _VIEW = 12, 40, 374, 130
@@ -76,7 +76,7 @@ def _draw_levels(draw: ImageDraw.ImageDraw, levels: list[Level]) -> None:
     top, gap = _TOP + _VIEW + 20, 12
     free = _BOTTOM - top - _TITLE * len(levels) - gap * (len(levels) - 1)
     row = min(24, free // sum(len(level.names) for level in levels))
-    size = min(14, row - 3)
+    size = min(14, max(row - 3, 6))
     start = _LEFT + 12 + max(draw.textlength(name, font(size, bold=True)) for level in levels for name in level.names)
     for level in levels:
         _draw_title(draw, level, top)
@@ -92,7 +92,9 @@ def _draw_title(draw: ImageDraw.ImageDraw, level: Level, top: int) -> None:
     end = start + draw.textlength(level.names[choice], font(14, bold=True)) + 14
     draw.rounded_rectangle((start, top - 1, end, top + 19), 4, fill=level.colours[choice])
     draw.text((start + 7, middle), level.names[choice], _PAPER, font(14, bold=True), anchor="lm")
-    draw.text((end + 8, middle), level.note, _FAINT, font(13), anchor="lm")
+    free = _RIGHT - end - 8 - draw.textlength(level.symbol, font(16)) - 6
+    size = next((size for size in range(13, 8, -1) if draw.textlength(level.note, font(size)) <= free), 8)
+    draw.text((end + 8, middle), level.note, _FAINT, font(size), anchor="lm")
     draw.text((_RIGHT, middle), level.symbol, _FAINT, font(16), anchor="rm")
 
 
@@ -102,7 +104,8 @@ def _draw_bars(draw: ImageDraw.ImageDraw, level: Level, start: int, top: int, ro
     for index, name in enumerate(level.names):
         chosen = index == level.decision.choice
         ink = _INK if level.decision.allowed[index] else _MASKED
-        upper, middle, lower = top + row * index + 3, top + row * (index + 0.5), top + row * (index + 1) - 4
+        gap = min(3, row // 6)
+        upper, middle, lower = top + row * index + gap, top + row * (index + 0.5), top + row * (index + 1) - gap - 1
         draw.text((_LEFT, middle), name, ink, font(size, bold=chosen), anchor="lm")
         draw.rectangle((start, upper, end, lower), fill=_TRACK)
         draw.text((start + 6, middle), level.remark(index), ink, font(size), anchor="lm")

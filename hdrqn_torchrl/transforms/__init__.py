@@ -1,5 +1,6 @@
-"""TorchRL transforms: the option book."""
+"""TorchRL transforms: the option book, and the window through which an agent sees a screen."""
 
 from hdrqn_torchrl.transforms.subgoal import SubgoalTransform, advance_option, intrinsic_reward
+from hdrqn_torchrl.transforms.window import Window
 
-__all__ = ["SubgoalTransform", "advance_option", "intrinsic_reward"]
+__all__ = ["SubgoalTransform", "Window", "advance_option", "intrinsic_reward"]

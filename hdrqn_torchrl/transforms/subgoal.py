@@ -30,7 +30,7 @@ class SubgoalTransform(Transform):
        ``wrong_subgoal_reward`` if another subgoal was attained;
     4. ``option_return`` :math:`\mathrel{+}= \gamma^{k} r^{ex}`, ``option_steps`` :math:`= k + 1`;
     5. ``option_done`` = reached, or the episode is done, or ``max_option_steps`` are over, or :math:`g` can no
-       longer be reached; ``option_terminated`` = reached or the episode terminated.
+       longer be chosen; ``option_terminated`` = reached or the episode terminated.
 
     The policy's ``subgoal`` becomes an additional action. Put every transform that can end an episode
     (``StepCounter(max_steps)``) *before* this one, so that each end of an episode closes its option.
@@ -44,6 +44,8 @@ class SubgoalTransform(Transform):
         wrong_subgoal_reward: intrinsic reward for attaining a subgoal other than the active one.
         repeatable: whether a subgoal can be attained more than once in an episode. If not,
             ``subgoal_mask`` excludes what was attained, and an option that pursues it ends after one step.
+        available_key: subgoals that are worth choosing now ``[*batch, G]``, written by the environment; it becomes
+            ``subgoal_mask``, and ``repeatable`` is not asked. ``None``: the environment says nothing about it.
         critic: computes ``attained`` ``[*batch, G]`` from the tensordict that follows a step. ``None`` reads
             ``attained_key``, which the environment then has to write.
         attained_key, hazard_key, extrinsic_reward_key: entries of the environment; ``hazard_key=None``: no hazard.
@@ -74,6 +76,7 @@ class SubgoalTransform(Transform):
         hazard_reward: float = -1.0,
         wrong_subgoal_reward: float = 0.0,
         repeatable: bool = False,
+        available_key: NestedKey | None = None,
         critic: Callable[[TensorDictBase], Tensor] | None = None,
         attained_key: NestedKey = keys.ATTAINED,
         hazard_key: NestedKey | None = keys.HAZARD,
@@ -101,11 +104,12 @@ class SubgoalTransform(Transform):
         self._carried = [option_init_key, active_subgoal_key, subgoal_mask_key, option_steps_key, option_return_key]
         self._reported = [subgoal_reached_key, option_done_key, option_terminated_key]
         in_keys = [attained_key] if critic is None else []
-        in_keys += [extrinsic_reward_key] + ([hazard_key] if hazard_key is not None else [])
+        in_keys += [extrinsic_reward_key, *(key for key in (hazard_key, available_key) if key is not None)]
         super().__init__(in_keys=in_keys, out_keys=[*self._carried, *self._reported, intrinsic_reward_key])
         self.num_subgoals, self.gamma, self.max_option_steps = num_subgoals, gamma, max_option_steps
         self.reached_reward, self.hazard_reward = reached_reward, hazard_reward
         self.wrong_subgoal_reward, self.repeatable, self.critic = wrong_subgoal_reward, repeatable, critic
+        self.available_key = available_key
         self.attained_key, self.hazard_key, self.extrinsic_reward_key = attained_key, hazard_key, extrinsic_reward_key
         self.done_key, self.terminated_key, self.subgoal_key = done_key, terminated_key, subgoal_key
         self.option_init_key, self.active_subgoal_key = option_init_key, active_subgoal_key
@@ -129,9 +133,9 @@ class SubgoalTransform(Transform):
         done = reached | next_tensordict.get(self.done_key)
         if self.max_option_steps is not None:
             done = done | (steps >= self.max_option_steps)
-        if not self.repeatable:
+        if self.available_key is not None or not self.repeatable:
             done = done | ~mask.gather(-1, chosen)
-            mask = mask & ~attained
+            mask = mask & ~attained if self.available_key is None else next_tensordict.get(self.available_key).clone()
 
         for key, value in (
             (self.option_init_key, done),
@@ -160,7 +164,10 @@ class SubgoalTransform(Transform):
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         reset = tensordict.get("_reset", None)
-        for key, fresh in self._fresh_book(tensordict_reset.batch_size, tensordict_reset.device).items():
+        book = self._fresh_book(tensordict_reset.batch_size, tensordict_reset.device)
+        if self.available_key is not None:
+            book[self.subgoal_mask_key] = tensordict_reset.get(self.available_key).clone()
+        for key, fresh in book.items():
             if reset is not None and (kept := tensordict.get(key, None)) is not None:
                 fresh = torch.where(expand_as_right(reset.view(tensordict.batch_size), kept), fresh, kept)
             tensordict_reset.set(key, fresh)

@@ -120,5 +120,5 @@ def test_names_and_ends():
 
 
 def test_other_environments_have_no_picture():
-    with pytest.raises(ValueError, match="env must be a MultiGoalGridEnv to be drawn, got GymEnv"):
+    with pytest.raises(ValueError, match="env must be a MultiGoalGridEnv or a MontezumaEnv to be drawn, got GymEnv"):
         scene_of(GymEnv("CartPole-v1"))

@@ -1,0 +1,80 @@
+"""Legs: options by where they began and where they were to lead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hdrqn_torchrl import keys
+
+
+class LegCounter:
+    """Counts options by the subgoal that was attained last when they began, and by the one they pursued.
+
+    Row G stands for the start of an episode. Where an episode begins at a subgoal (practice), ``attained`` of its
+    reset says so.
+
+    Args:
+        num_subgoals: G.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> yes, no = torch.tensor([[[True]]]), torch.tensor([[[False]]])
+        >>> after = {"attained": torch.tensor([[[False, True]]]), "active_subgoal": torch.tensor([[1]]),
+        ...          "option_done": yes, "subgoal_reached": yes}
+        >>> root = {"is_init": yes, "option_init": yes, "attained": torch.tensor([[[False, False]]]), "next": after}
+        >>> legs = LegCounter(2)
+        >>> legs.add(TensorDict(root, [1, 1]))
+        >>> legs.options.tolist(), legs.reached.tolist()
+        ([[0, 0], [0, 0], [0, 1]], [[0, 0], [0, 0], [0, 1]])
+    """
+
+    def __init__(self, num_subgoals: int) -> None:
+        self.num_subgoals = num_subgoals
+        self.options = torch.zeros(num_subgoals + 1, num_subgoals, dtype=torch.int64)
+        """``[G + 1, G]``: options that have ended."""
+        self.reached = torch.zeros_like(self.options)
+        """``[G + 1, G]``: those of them that reached their subgoal."""
+        self._place: Tensor | None = None  # [N]: attained last
+        self._origin: Tensor | None = None  # [N]: attained last when the option began
+
+    def add(self, batch: TensorDictBase) -> None:
+        """Takes a collected batch ``[N, T]``."""
+        for step in batch.unbind(1):
+            self.add_step(step)
+
+    def add_step(self, step: TensorDictBase) -> None:
+        """Takes one step of all environments ``[N]``, its outcome below ``"next"``."""
+        start, after = torch.tensor(self.num_subgoals), step.get("next")
+        if self._place is None or self._origin is None:
+            self._place = self._origin = start.expand(step.batch_size)
+        fresh = torch.where(step[keys.ATTAINED].any(-1), step[keys.ATTAINED].int().argmax(-1), start)
+        place = torch.where(step[keys.IS_INIT].squeeze(-1), fresh, self._place)
+        self._origin = torch.where(step[keys.OPTION_INIT].squeeze(-1), place, self._origin)
+        leg = self._origin * self.num_subgoals + after[keys.ACTIVE_SUBGOAL]
+        for counts, happened in ((self.options, keys.OPTION_DONE), (self.reached, keys.SUBGOAL_REACHED)):
+            counts.view(-1).index_add_(0, leg, after[happened].squeeze(-1).long())
+        attained = after[keys.ATTAINED]
+        self._place = torch.where(attained.any(-1), attained.int().argmax(-1), place)
+
+    @property
+    def rates(self) -> Tensor:
+        """``[G + 1, G]``: share of the options that reached their subgoal; NaN where there was none."""
+        return self.reached / self.options
+
+    def clear(self) -> None:
+        """Counts from zero again; episodes and options in progress go on."""
+        self.options.zero_()
+        self.reached.zero_()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counts, and where the options in progress began."""
+        return {"options": self.options, "reached": self.reached, "place": self._place, "origin": self._origin}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.options, self.reached = state["options"].clone(), state["reached"].clone()
+        self._place, self._origin = state["place"], state["origin"]

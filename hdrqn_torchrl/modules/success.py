@@ -1,0 +1,120 @@
+"""How often options reach their subgoal lately, and exploration that depends on it."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.modules.exploration import RepeatingEpsilonGreedy
+
+
+class SubgoalSuccess(nn.Module):
+    """Share of the options for each subgoal that reached it: a moving average over the last ones.
+
+    Args:
+        num_subgoals: G.
+        window: number of options that the average goes over; fewer while there have not been so many.
+        active_subgoal_key, option_done_key, reached_key: written by
+            :class:`~hdrqn_torchrl.transforms.SubgoalTransform`, read below ``"next"``.
+
+    Raises:
+        ValueError: if a number is not positive.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> success = SubgoalSuccess(num_subgoals=2)
+        >>> done, reached = torch.tensor([[[True], [True]]]), torch.tensor([[[True], [False]]])
+        >>> step = {"active_subgoal": torch.tensor([[1, 1]]), "option_done": done, "subgoal_reached": reached}
+        >>> success.observe(TensorDict({"next": step}, [1, 2]))
+        >>> success.rates.tolist()
+        [0.0, 0.5]
+    """
+
+    rates: Tensor
+    """``[G]``; 0 as long as there was no option."""
+    options: Tensor
+    """``[G]``: how many options have ended."""
+
+    def __init__(
+        self,
+        num_subgoals: int,
+        *,
+        window: int = 100,
+        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
+        option_done_key: NestedKey = keys.OPTION_DONE,
+        reached_key: NestedKey = keys.SUBGOAL_REACHED,
+    ) -> None:
+        super().__init__()
+        for name, value, usual in (("num_subgoals", num_subgoals, 6), ("window", window, 100)):
+            if value < 1:
+                raise ValueError(f"{name} must be >= 1, got {value}; for example {usual}.")
+        self.window = window
+        self._keys = [("next", key) for key in (active_subgoal_key, option_done_key, reached_key)]
+        self.register_buffer("rates", torch.zeros(num_subgoals))
+        self.register_buffer("options", torch.zeros(num_subgoals, dtype=torch.int64))
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Counts the options that ended in a collected batch ``[N, T]``; they are all equally recent."""
+        subgoal, done, reached = (batch.get(key) for key in self._keys)
+        pursued = one_hot(subgoal, len(self.rates)) * done.long()  # [N, T, G]
+        ended, won = pursued.flatten(0, -2).sum(0), (pursued * reached.long()).flatten(0, -2).sum(0)
+        self.options += ended
+        remembered = self.options.clamp(max=self.window).float()
+        share = (ended / remembered.clamp(min=1)).clamp(max=1.0)
+        self.rates.lerp_(won / ended.clamp(min=1), share)
+
+
+class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
+    r"""Explores the less the more often a subgoal is reached: for subgoal g,
+    :math:`\epsilon_g = \max(\epsilon_{end}, \epsilon (1 - \text{success}_g))` (Kulkarni et al., 2016), where
+    :math:`\epsilon` follows its schedule.
+
+    Args:
+        start, end, anneal_frames, ladder, exponent, max_repeats: as in :class:`RepeatingEpsilonGreedy`; with
+            ``max_repeats=1`` random actions are not repeated. By default the schedule stays at ``start``: only success
+            counts.
+        window: of :class:`SubgoalSuccess`.
+
+    Examples:
+        >>> exploration = SuccessEpsilonGreedy(1.0, 0.1)
+        >>> exploration.set_num_subgoals(2)
+        >>> _ = exploration.success.rates.copy_(torch.tensor([0.25, 0.95]))
+        >>> exploration.epsilons(torch.zeros(2), torch.tensor([0, 1])).tolist()
+        [0.75, 0.10000000149011612]
+    """
+
+    success: SubgoalSuccess
+
+    def __init__(
+        self,
+        start: float = 1.0,
+        end: float = 0.1,
+        *,
+        anneal_frames: int = 10**9,
+        ladder: float = 0.0,
+        exponent: float = 2.0,
+        max_repeats: int = 1,
+        window: int = 100,
+    ) -> None:
+        super().__init__(
+            start, end, anneal_frames=anneal_frames, ladder=ladder, exponent=exponent, max_repeats=max_repeats
+        )
+        self.window = window
+
+    def set_num_subgoals(self, num_subgoals: int) -> None:
+        """Must be called before it chooses; the builders of hierarchical algorithms do."""
+        self.success = SubgoalSuccess(num_subgoals, window=self.window)
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Learns from a collected batch how often subgoals were reached."""
+        self.success.observe(batch)
+
+    def epsilons(self, like: Tensor, subgoal: Tensor | None = None) -> Tensor:
+        """Epsilon of each environment, for the subgoal ``[N]`` that it pursues."""
+        scheduled = super().epsilons(like)
+        if subgoal is None:
+            return scheduled
+        return (scheduled * (1.0 - self.success.rates[subgoal])).clamp(min=self.end)

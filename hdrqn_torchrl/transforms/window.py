@@ -1,0 +1,108 @@
+"""What an agent sees of a screen: a window around it."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torch.nn.functional import interpolate
+from torchrl.data import Bounded, Composite
+from torchrl.envs.transforms import Transform
+
+from hdrqn_torchrl import keys
+
+
+class Window(Transform):
+    """Cuts a square window around the agent out of a screen and resizes it (section IV-D: 70x70 to 44x44 pixels).
+
+    TorchRL's ``CenterCrop`` and ``Resize`` know no place that moves with the agent, hence this transform.
+
+    Args:
+        view: side of the window in pixels, black beyond the edges of the screen; ``None``: the whole screen.
+        size: side of the image.
+        keep_pixels: keep the screen; else it is gone after the window was cut out.
+        pixels_key: screen ``[*batch, height, width, C]`` uint8.
+        position_key: the agent's centre, x and y in pixels ``[*batch, 2]``; not read for the whole screen.
+        out_key: image ``[*batch, C, size, size]`` uint8.
+
+    Raises:
+        ValueError: if ``view`` or ``size`` is not positive.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> pixels, position = torch.full((210, 160, 3), 9, dtype=torch.uint8), torch.tensor([0.0, 90.0])
+        >>> step = TensorDict({"pixels": pixels, "position": position})
+        >>> image = Window(view=70, size=2).forward(step)["observation"]
+        >>> image[0].tolist()  # beyond the left edge it is black
+        [[1, 8], [1, 8]]
+    """
+
+    def __init__(
+        self,
+        view: int | None = 70,
+        size: int = 44,
+        *,
+        keep_pixels: bool = False,
+        pixels_key: NestedKey = keys.PIXELS,
+        position_key: NestedKey = keys.POSITION,
+        out_key: NestedKey = keys.OBSERVATION,
+    ) -> None:
+        if view is not None and view < 1:
+            raise ValueError(f"view must be >= 1 or None, got {view}; the paper's is 70, None shows the whole screen.")
+        if size < 1:
+            raise ValueError(f"size must be >= 1, got {size}; the paper's is 44.")
+        super().__init__(in_keys=[pixels_key, position_key], out_keys=[out_key])
+        self.view, self.size, self.keep_pixels = view, size, keep_pixels
+        self.pixels_key, self.position_key, self.out_key = pixels_key, position_key, out_key
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        pixels = tensordict.get(self.pixels_key)
+        if self.view is not None:
+            pixels = cut_out(pixels, tensordict.get(self.position_key), self.view)
+        tensordict.set(self.out_key, resized(pixels, self.size))
+        return tensordict if self.keep_pixels else tensordict.exclude(self.pixels_key, inplace=True)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        screen = observation_spec[self.pixels_key]
+        shape = (*screen.shape[:-3], screen.shape[-1], self.size, self.size)
+        observation_spec[self.out_key] = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=screen.device)
+        if not self.keep_pixels:
+            del observation_spec[self.pixels_key]
+        return observation_spec
+
+
+def cut_out(pixels: Tensor, position: Tensor, view: int) -> Tensor:
+    """Windows around places on screens, black beyond their edges.
+
+    Args:
+        pixels: ``[*, height, width, C]``.
+        position: x and y of the centres ``[*, 2]``.
+        view: side of the window.
+
+    Returns:
+        ``[*, view, view, C]``.
+    """
+    height, width, channels = pixels.shape[-3:]
+    flat = pixels.reshape(-1, height, width, channels)
+    first = (position.reshape(-1, 2) - view / 2).round().long()  # [N, 2]
+    reach = torch.arange(view, device=pixels.device)
+    columns, rows = first[:, :1] + reach, first[:, 1:] + reach  # [N, view]
+    row_seen, column_seen = (rows >= 0) & (rows < height), (columns >= 0) & (columns < width)
+    number = torch.arange(len(flat), device=pixels.device)[:, None, None]
+    windows = flat[number, rows.clamp(0, height - 1)[:, :, None], columns.clamp(0, width - 1)[:, None, :]]
+    seen = row_seen[:, :, None] & column_seen[:, None, :]
+    return windows.mul_(seen.unsqueeze(-1)).view(*pixels.shape[:-3], view, view, channels)
+
+
+def resized(pixels: Tensor, size: int) -> Tensor:
+    """Screens ``[*, height, width, C]`` as square images ``[*, C, size, size]``, bilinear with antialiasing."""
+    batch = pixels.shape[:-3]
+    images = pixels.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)
+    small = interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
+    return small.contiguous().view(*batch, *small.shape[1:])

@@ -1,0 +1,82 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from hdrqn_torchrl.modules import SubgoalSuccess, SuccessEpsilonGreedy
+
+
+def batch(*options):
+    """A batch ``[1, T]`` of steps, each (subgoal, done, reached)."""
+    subgoal, done, reached = (torch.tensor(column)[None] for column in zip(*options, strict=True))
+    step = {"active_subgoal": subgoal, "option_done": done[..., None], "subgoal_reached": reached[..., None]}
+    return TensorDict({"next": step}, [1, len(options)])
+
+
+WON, LOST, GOES_ON = (0, True, True), (0, True, False), (0, False, False)
+
+
+class TestSubgoalSuccess:
+    def test_the_share_of_options_that_reached_their_subgoal(self):
+        success = SubgoalSuccess(3)
+        success.observe(batch(WON, LOST, GOES_ON, WON, (2, True, False), LOST))
+        assert success.rates.tolist() == [0.5, 0.0, 0.0]
+        assert success.options.tolist() == [4, 0, 1]
+
+    def test_few_options_count_alike_in_however_many_batches_they_come(self):
+        success = SubgoalSuccess(1, window=10)
+        for each in (WON, LOST, LOST, WON, LOST):
+            success.observe(batch(each))
+        assert success.rates.item() == pytest.approx(0.4)
+
+    def test_then_the_last_ones_count(self):
+        success = SubgoalSuccess(1, window=4)
+        for _ in range(20):
+            success.observe(batch(LOST))
+        success.observe(batch(WON))
+        assert success.rates.item() == pytest.approx(0.25)
+        success.observe(batch(*[WON] * 8))
+        assert success.rates.item() == 1.0
+
+    def test_nothing_ended(self):
+        success = SubgoalSuccess(1)
+        success.observe(batch(WON))
+        success.observe(batch(GOES_ON, GOES_ON))
+        assert success.rates.item() == 1.0
+
+    @pytest.mark.parametrize(("name", "settings"), [("num_subgoals", (0,)), ("window", (2,))])
+    def test_wrong_settings(self, name, settings):
+        with pytest.raises(ValueError, match=f"{name} must be >= 1, got 0; "):
+            SubgoalSuccess(*settings, **({"window": 0} if name == "window" else {}))
+
+
+class TestSuccessEpsilonGreedy:
+    def explored(self, exploration, subgoal):
+        """How often a random action was taken."""
+        values = torch.zeros(2000, 50)
+        values[:, 0] = 1.0
+        subgoal = torch.full((2000,), subgoal)
+        with set_exploration_type(ExplorationType.RANDOM):
+            action, _ = exploration.extend(values, torch.zeros(2000, 2, dtype=torch.int64), subgoal)
+        return (action != 0).float().mean().item() * 50 / 49
+
+    def test_epsilon_of_each_subgoal(self):
+        exploration = SuccessEpsilonGreedy(1.0, 0.1)
+        exploration.set_num_subgoals(3)
+        exploration.success.rates.copy_(torch.tensor([0.0, 0.6, 1.0]))
+        for subgoal, epsilon in enumerate((1.0, 0.4, 0.1)):
+            assert self.explored(exploration, subgoal) == pytest.approx(epsilon, abs=0.05)
+
+    def test_it_learns_from_batches_and_its_state_travels_with_the_weights(self):
+        exploration, other = SuccessEpsilonGreedy(), SuccessEpsilonGreedy()
+        for each in (exploration, other):
+            each.set_num_subgoals(1)
+        exploration.observe(batch(WON, WON, WON, LOST))
+        other.load_state_dict(exploration.state_dict())
+        assert other.epsilons(torch.zeros(1), torch.tensor([0])).item() == pytest.approx(0.25)
+
+    def test_the_schedule_counts_too(self):
+        exploration = SuccessEpsilonGreedy(1.0, 0.1, anneal_frames=100)
+        exploration.set_num_subgoals(1)
+        exploration.step(1000)
+        assert exploration.epsilons(torch.zeros(1), torch.tensor([0])).item() == pytest.approx(0.1)
