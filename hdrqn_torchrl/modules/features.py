@@ -92,8 +92,9 @@ class ConvFeatures(Features):
     def forward(self, image: Tensor) -> Tensor:
         images = image.reshape(-1, *image.shape[-3:]).to(memory_format=torch.channels_last)
         first, others = self.convolutions[0], self.convolutions[1:]
+        assert isinstance(first, nn.Conv2d)
         weight = first.weight
-        if images.dtype == torch.uint8:  # bfloat16 holds bytes exactly, and there are fewer weights to scale than pixels
+        if images.dtype == torch.uint8:  # exact in bfloat16, too; and there are fewer weights to scale than pixels
             images, weight = images.to(autocast_dtype(images) or weight.dtype), weight / 255
         features = self.dense(others(functional.conv2d(images, weight, first.bias, first.stride)))
         return features.view(*image.shape[:-3], self.out_features)
