@@ -113,7 +113,7 @@ class TestResumingAFolder:
             plan_for(f"resume={run}", "seed=2", "algo.sub.tau=0.5", "env.view=5", "threads=2", "algo.gamma=0.99")
         assert str(refusal.value).splitlines() == [
             "settings must be those of the run that is resumed, and differ from outputs/a/1:",
-            "  algo.sub.tau: 0.01 -> 0.5",
+            "  algo.sub.tau: 0.003 -> 0.5",
             "  env.view: 3 -> 5",
             "  seed: 1 -> 2",
             "  threads: 1 -> 2",
