@@ -72,6 +72,9 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
     :math:`\epsilon_g = \max(\epsilon_{end}, \epsilon (1 - \text{success}_g))` (Kulkarni et al., 2016), where
     :math:`\epsilon` follows its schedule.
 
+    While epsilon is 1, success is that of random actions and can't rise: a ladder (or the schedule) has to make some
+    environments act on what they learned.
+
     Args:
         start, end, anneal_frames, ladder, exponent, max_repeats: as in :class:`RepeatingEpsilonGreedy`; with
             ``max_repeats=1`` random actions are not repeated. By default the schedule stays at ``start``: only success
