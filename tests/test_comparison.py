@@ -7,7 +7,6 @@ from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import same_color
-from matplotlib.figure import Figure
 
 from hdrqn_torchrl.comparison import GREEDY, PAPER, Panel, plot_bars, plot_curves
 from hdrqn_torchrl.estimates import Estimate, Group, TaskResults, estimate_curves, estimate_finals
@@ -16,16 +15,6 @@ from hdrqn_torchrl.results import Run
 COLUMNS = [name for panel in (*PAPER, *GREEDY) for name in panel if name]
 MEMORY = {"memory": {"return_mean": 2.0, "success_rate": 1.0, "steps_mean": 15.5}}
 RANDOM = {"random": {"return_mean": -0.9, "success_rate": 0.03, "steps_mean": 48.8}}
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures as they are when they are saved."""
-    kept, save = [], Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *args, **kwargs: (kept.append(figure), save(figure, *args, **kwargs))
-    )
-    return kept
 
 
 def run_of(offset=0.0, points=3, finished=True, **columns):

@@ -1,18 +1,6 @@
 import numpy as np
-import pytest
-from matplotlib.figure import Figure
 
 from hdrqn_torchrl.figures import plot_legs, plot_places
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures as they are when they are saved."""
-    kept, save = [], Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *args, **kwargs: (kept.append(figure), save(figure, *args, **kwargs))
-    )
-    return kept
 
 
 def test_legs(tmp_path, figures):

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
 
 import plot
 from configuration import command_line
@@ -65,16 +64,6 @@ def outputs(tmp_path):
         make_run(tmp_path / f"outputs/gridworld-v2/seed{seed}", seed=seed, offset=seed)
         make_run(tmp_path / f"outputs/gridworld-dqn/seed{seed}", seed=seed, algo="dqn", finished=seed == 0)
     return tmp_path / "outputs"
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures as they are when they are saved."""
-    kept, save = [], Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *args, **kwargs: (kept.append(figure), save(figure, *args, **kwargs))
-    )
-    return kept
 
 
 def table(path="table.csv"):

@@ -2,7 +2,6 @@ import math
 
 import pytest
 from matplotlib import pyplot
-from matplotlib.figure import Figure
 
 from hdrqn_torchrl.plotting import plot_run
 
@@ -13,16 +12,6 @@ METRICS = {
     "greedy/steps": [50.0, math.nan, 20.0],
 }
 REFERENCES = {"memory": {"return_mean": 2.0, "steps_mean": 16.5}, "random": {"return_mean": -0.35, "steps_mean": 48.8}}
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """Figures as they are when they are saved."""
-    kept, save = [], Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda figure, *args, **kwargs: (kept.append(figure), save(figure, *args, **kwargs))
-    )
-    return kept
 
 
 def lines(axis):

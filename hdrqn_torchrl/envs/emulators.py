@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 if TYPE_CHECKING:
     from ale_py import ALEInterface
@@ -24,6 +26,17 @@ class Snapshot(NamedTuple):
     """``[128]``"""
     screen: Bytes
     """``[210, 160, 3]``; an emulator that is put back does not draw it again by itself."""
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Itself as a checkpoint holds it."""
+        state = np.frombuffer(self.state, np.uint8)
+        return {"state": torch.tensor(state), "ram": torch.tensor(self.ram), "screen": torch.tensor(self.screen)}
+
+    @classmethod
+    def of_tensors(cls, tensors: Mapping[str, Tensor]) -> Snapshot:
+        """What :meth:`tensors` was called on."""
+        state, ram, screen = (tensors[name].numpy() for name in cls._fields)
+        return cls(state.tobytes(), ram.copy(), screen.copy())
 
 
 class Emulators:

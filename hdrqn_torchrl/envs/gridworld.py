@@ -9,12 +9,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.data import Binary, Categorical, Composite, Unbounded
+from torchrl.data import Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid_rules import ACTIONS, GridRules, GridState, StepEvents
+from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
 
 
 class MultiGoalGridEnv(EnvBase):
@@ -97,24 +98,20 @@ class MultiGoalGridEnv(EnvBase):
     def _make_specs(self) -> None:
         n, view, goals, device = self.num_envs, self.rules.view, self.rules.num_goals, self.device
 
-        def flag(size: int) -> Binary:
-            return Binary(shape=(n, size), dtype=torch.bool, device=device)
-
         cells = Categorical(self.rules.num_codes, shape=(n, view, view), dtype=torch.uint8, device=device)
         self.observation_spec = Composite(
-            {keys.OBSERVATION: cells, keys.ATTAINED: flag(goals), keys.HAZARD: flag(1), keys.SUCCESS: flag(1)},
+            {
+                keys.OBSERVATION: cells,
+                keys.ATTAINED: flags(n, goals, device=device),
+                keys.HAZARD: flags(n, 1, device=device),
+                keys.SUCCESS: flags(n, 1, device=device),
+            },
             shape=(n,),
             device=device,
         )
         self.action_spec = Categorical(len(ACTIONS), shape=(n,), dtype=torch.int64, device=device)
-        self.reward_spec = Composite(
-            {key: Unbounded(shape=(n, 1), device=device) for key in (keys.REWARD, keys.EXTRINSIC_REWARD)},
-            shape=(n,),
-            device=device,
-        )
-        self.done_spec = Composite(
-            {key: flag(1) for key in (keys.DONE, keys.TERMINATED, keys.TRUNCATED)}, shape=(n,), device=device
-        )
+        self.reward_spec = rewards(n, device=device)
+        self.done_spec = episode_ends(n, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
         self._generator.manual_seed(0 if seed is None else seed)

@@ -8,15 +8,8 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 pytest.importorskip("ale_py")
 
-from hdrqn_torchrl.envs.montezuma import (
-    ALL_ACTIONS,
-    BOXES,
-    SUBGOALS,
-    USEFUL_ACTIONS,
-    MontezumaEnv,
-    locate,
-    make_montezuma,
-)
+from hdrqn_torchrl.envs.montezuma import ALL_ACTIONS, USEFUL_ACTIONS, MontezumaEnv, make_montezuma
+from hdrqn_torchrl.envs.montezuma_screen import BOXES, SUBGOALS, locate
 
 ROUTE = json.loads((Path(__file__).parent / "montezuma_route.json").read_text())
 """Actions that take the key and open the right door, and what happens at which step."""
