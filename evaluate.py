@@ -63,6 +63,7 @@ def main(settings: Settings) -> None:
     print(result)
     if settings.out is not None:
         try:
+            Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
             Path(settings.out).write_text(result + "\n")
         except OSError as error:
             raise SettingsError(f"out must be a file that can be written, got {settings.out} ({error}).") from error

@@ -10,10 +10,14 @@ out       text to write; its figures go to a folder of the same name. What stand
 size      small (default) or paper: which of a study's two sizes
 studies   only these: studies=gridworld,views; without it there is also an overview of all claims
 keep      archive (.tar.xz) to put the runs' settings and measurements into; weights are not kept
+
+The table of Montezuma's Revenge is made from what evaluate.py wrote into the run folders:
+python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_DIR/evaluations/greedy.json
 """
 
 from __future__ import annotations
 
+import json
 import re
 import tarfile
 import tempfile
@@ -28,19 +32,24 @@ from PIL import Image
 
 from configuration import SettingsError, command_line
 from hdrqn_torchrl.claims import Results
-from hdrqn_torchrl.comparison import GREEDY, PAPER, plot_curves
+from hdrqn_torchrl.comparison import plot_curves
 from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals
+from hdrqn_torchrl.figures import plot_legs_over_time
 from hdrqn_torchrl.grouping import Entry, value_of
 from hdrqn_torchrl.results import final_value
 from plot import YAML_LOADER, as_list, common_references, read_entries
-from studies import STUDIES, Job, Study, flat, is_run_of, jobs_of
+from studies import STUDIES, Drawing, Job, Study, flat, is_run_of, jobs_of
 
-KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json")
+KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json", "evaluations/*.json")
 SIZES = ("small", "paper")
 QUANTITIES = ("return", "success", "in_order", "steps")
 HEADER = (
     "| | seeds | return | 95 % interval | IQM | share of the ceiling | in order | all in order | steps | frames "
     "| wall time | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+)
+SCREEN_HEADER = (
+    "| | seed | trained frames | epsilon | sticky | score | 95 % interval | key | a door | steps | episodes "
+    "| commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 CLAIMS = "| claim (of greedy play at the end) | | measured |\n|---|---|---|"
 _NAMES = [study.name for study in STUDIES]
@@ -152,12 +161,13 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
         return lines[0], []
     beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]
     tasks = rows_of_study(study, found, beside)
-    if study.figures:
-        name = study.name if settings.size == "small" else f"{study.name}_paper"
-        lines += figures(study.title, Path(settings.out).with_suffix("") / name, tasks)
+    name = study.name if settings.size == "small" else f"{study.name}_paper"
+    lines += figures(study, Path(settings.out).with_suffix("") / name, tasks)
     for title, groups in tasks:
-        lines += ["", f"**{title}**", "", HEADER] if len(tasks) > 1 else ["", HEADER]
-        lines += [table_row(label, members) for label, members in groups.items()]
+        lines += ["", f"**{title}**"] if len(tasks) > 1 else []
+        lines += ["", SCREEN_HEADER if study.on_screen else HEADER]
+        for label, members in groups.items():
+            lines += screen_rows(label, members) if study.on_screen else [table_row(label, members)]
     verdicts = []
     for claim in study.claims:
         for title, groups in tasks:
@@ -169,18 +179,30 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
     return "\n".join(lines), verdicts
 
 
-def figures(title: str, path: Path, tasks: list[tuple[str, dict[str, list[Found]]]]) -> list[str]:
-    """Draws a study while training and in greedy play; lines that show both."""
-    curves = [sum_up(row, groups) for row, groups in tasks]
+def figures(study: Study, path: Path, tasks: list[tuple[str, dict[str, list[Found]]]]) -> list[str]:
+    """Draws a study; lines that show the pictures."""
     lines = []
-    for when, ending, panels in (("while training", "", PAPER), ("greedy play", "_greedy", GREEDY)):
-        picture = path.with_name(f"{path.name}{ending}.png")
-        plot_curves(curves, [picture], panels=panels, axis="episodes")
-        with Image.open(picture) as image:
-            few_colours = image.convert("P", palette=Image.Palette.ADAPTIVE)
-        few_colours.save(picture, optimize=True)  # a third of the size
-        lines += ["", f"![{title}: {when}]({path.parent.name}/{picture.name})"]
+    for drawing in study.drawings:
+        picture = path.with_name(f"{path.name}{drawing.ending}.png")
+        curves = [sum_up(row, groups, drawing) for row, groups in tasks]
+        plot_curves(curves, [picture], panels=drawing.panels, axis=drawing.axis)
+        lines += shown(picture, f"{study.title}: {drawing.shows}")
+    for _, groups in tasks if study.on_screen else []:
+        for label, members in groups.items():
+            first = min(members, key=lambda run: value_of(run.entry, "seed"))
+            if "legs/start_to_0" in first.entry.run.metrics:
+                picture = path.with_name(f"{path.name}_legs_{label}.png")
+                plot_legs_over_time(first.entry.run, first.settings["env.subgoals"], picture)
+                lines += shown(picture, f"{study.title}: options of {label} that reached their subgoal")
     return lines
+
+
+def shown(picture: Path, title: str) -> list[str]:
+    """Lines that show a picture, which is made a third as large."""
+    with Image.open(picture) as image:
+        few_colours = image.convert("P", palette=Image.Palette.ADAPTIVE)
+    few_colours.save(picture, optimize=True)
+    return ["", f"![{title}]({picture.parent.name}/{picture.name})"]
 
 
 def rows_of_study(study: Study, found: Runs, beside: Runs) -> list[tuple[str, dict[str, list[Found]]]]:
@@ -195,14 +217,14 @@ def rows_of_study(study: Study, found: Runs, beside: Runs) -> list[tuple[str, di
     return list(rows.items())
 
 
-def sum_up(title: str, groups: dict[str, list[Found]]) -> TaskResults:
+def sum_up(title: str, groups: dict[str, list[Found]], drawing: Drawing) -> TaskResults:
     """Curves of the groups of a row."""
-    columns = [name for panel in (*PAPER, *GREEDY) for name in panel if name]
+    columns = [name for panel in drawing.panels for name in panel.columns]
     summed = []
     for label, members in groups.items():
         entries = [each.entry for each in members]
         runs = [entry.run for entry in entries]
-        estimates = estimate_curves(runs, columns, axis="episodes")
+        estimates = estimate_curves(runs, columns, axis=drawing.axis)
         summed.append(Group(label, runs, estimates, common_references(entries, "known")))
     return TaskResults(title, summed)
 
@@ -224,7 +246,7 @@ def table_row(label: str, members: list[Found]) -> str:
     """Final results of a group as a line of a Markdown table."""
     runs = [each.entry.run for each in members]
     done = [run for run in runs if run.summary]
-    commits = ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
+    commits = commits_of(members)
     seeds = ", ".join(sorted(value_of(each.entry, "seed") for each in members if each.entry.run.summary))
     if not done:
         return f"| {label} | none finished | | | | | | | | | | {commits} |"
@@ -242,6 +264,31 @@ def table_row(label: str, members: list[Found]) -> str:
         f"{mean[columns[1]]:.0%}", f"{mean[columns[3]]:.1f}", f"{frames / 1000:.0f}k", f"{minutes:.0f} min", commits,
     )  # fmt: skip
     return "| " + " | ".join(cells) + " |"
+
+
+def commits_of(members: list[Found]) -> str:
+    """Where the runs' code stood."""
+    return ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
+
+
+def screen_rows(label: str, members: list[Found]) -> list[str]:
+    """What ``evaluations/*.json`` of a group's runs say, as lines of a Markdown table."""
+    rows = []
+    for member in members:
+        run = member.entry.run
+        results = [json.loads(path.read_text()) for path in (run.folder / "evaluations").glob("*.json")]
+        for result in sorted(results, key=lambda each: (each["env"]["sticky"], each["epsilon"])):
+            key = result["per_subgoal"][list(result["env"]["subgoals"]).index("key")]["attained"]
+            low, high = result["intervals"]["return_mean"]
+            cells = (
+                *(label, value_of(member.entry, "seed"), f"{run.metrics['frames'][-1] / 1000:.0f}k"),
+                *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),
+                *(f"{result['return_mean']:.0f}", f"{low:.0f} to {high:.0f}", f"{key:.0%}"),
+                *(f"{result['success_rate']:.0%}", f"{result['steps_mean']:.0f}", f"{result['episodes']}"),
+                commits_of([member]),
+            )
+            rows.append("| " + " | ".join(cells) + " |")
+    return rows
 
 
 def put(text: str, mark: str, part: str) -> str:
@@ -269,10 +316,9 @@ def keep(runs: list[Found], archive: Path) -> None:
     partial = archive.with_name(archive.name + ".partial")
     with tarfile.open(partial, "w:xz") as file:
         for number, run in enumerate(sorted(runs, key=lambda run: sorted(map(str, run.settings.items())))):
-            for name in KEPT:
-                path = run.entry.run.folder / name
-                if path.exists():
-                    file.add(path, f"{number:03d}/{name}", filter=undated)
+            folder = run.entry.run.folder
+            for path in sorted(path for pattern in KEPT for path in folder.glob(pattern)):
+                file.add(path, f"{number:03d}/{path.relative_to(folder)}", filter=undated)
     partial.replace(archive)
 
 

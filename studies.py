@@ -13,6 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from hdrqn_torchrl.claims import Alike, Claim, Near, Ordered
+from hdrqn_torchrl.comparison import GREEDY, PAPER, Panel
 from resuming import FREE
 
 _IRRELEVANT = (*FREE, "logger", "device", "threads", "log_frames")  # to what is learned
@@ -23,6 +24,44 @@ ALGORITHMS = (  # the first three are the paper's
     Ordered("return", ["hdqn", ["drqn", "dqn"]]),
     Ordered("return", [["v1", "v2", "v3"], ["hdqn", "drqn", "dqn"]]),
     Ordered("return", ["v3", ["v1", "v2"]]),
+)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One figure of a study."""
+
+    shows: str
+    ending: str
+    """Of its file's name."""
+    panels: tuple[Panel, ...]
+    axis: str = "episodes"
+
+
+AS_IN_PAPER = (Drawing("while training", "", PAPER), Drawing("greedy play", "_greedy", GREEDY))
+SCREEN = (  # subgoals are numbered as in conf/env/montezuma.yaml
+    Drawing(
+        "while training (practice included) and, as points, greedy play from the start",
+        "",
+        (
+            Panel("behaviour/return", "greedy/return", "score per episode"),
+            Panel("behaviour/attained_3", label="episodes with the key"),
+            Panel("behaviour/success", "greedy/success", "episodes that open a door"),
+        ),
+        axis="frames",
+    ),
+    *(
+        Drawing(
+            f"visits of the places on the {side} while training",
+            f"_{side}",
+            tuple(Panel(f"behaviour/visits_{number}", label=f"{name} per episode") for number, name in places),
+            axis="frames",
+        )
+        for side, places in (
+            ("right", ((0, "middle ladder"), (1, "bottom right ladder"), (5, "right door"))),
+            ("left", ((2, "bottom left ladder"), (3, "key"), (4, "left door"))),
+        )
+    ),
 )
 
 
@@ -42,7 +81,9 @@ class Study:
     claims: tuple[Claim, ...] = ()
     sizes: tuple[str, ...] = ("small", "paper")
     """In which it exists."""
-    figures: bool = True
+    drawings: tuple[Drawing, ...] = AS_IN_PAPER
+    on_screen: bool = False
+    """Its table is made from ``evaluations/*.json`` of the run folders, and there are pictures of legs."""
 
 
 STUDIES = (
@@ -105,7 +146,7 @@ STUDIES = (
         by=("algo.learner.learning_rate", "algo.learner.tau"),
         rows="algo",
         sizes=("small",),
-        figures=False,
+        drawings=(),
     ),
     Study(
         "tuning_hierarchical",
@@ -113,7 +154,15 @@ STUDIES = (
         by=("algo.sub.learning_rate", "algo.sub.tau"),
         rows="algo",
         sizes=("small",),
-        figures=False,
+        drawings=(),
+    ),
+    Study(
+        "montezuma",
+        "Montezuma's Revenge, first screen",
+        by=("algo",),
+        sizes=("small",),
+        drawings=SCREEN,
+        on_screen=True,
     ),
 )
 

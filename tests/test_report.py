@@ -131,6 +131,47 @@ def test_a_run_stands_for_what_a_study_calls_it(run, outputs):
     assert rows == ["v2", "v2_cell"]
 
 
+class TestScreen:
+    """Montezuma's Revenge: score, key and door as evaluate.py measured them, and legs."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        folder = make_run(tmp_path / "outputs/v3", "experiment=montezuma", "algo=v3", finished=False)
+        places = [*range(6), "start"]
+        extra = {"behaviour/attained_3": 0.5, "behaviour/success": 0.25}
+        extra |= {f"behaviour/visits_{number}": number for number in range(6)}
+        extra |= {f"legs/{place}_to_{goal}": 0.75 for place in places for goal in range(6)}
+        names, *rows = (folder / "metrics.csv").read_text().splitlines()
+        added = ",".join(map(str, extra.values()))
+        (folder / "metrics.csv").write_text(
+            "\n".join([f"{names},{','.join(extra)}", *(f"{r},{added}" for r in rows), ""])
+        )
+        (folder / "evaluations").mkdir()
+        for name, epsilon, sticky in (("a", 0.05, 0.25), ("b", 0.0, 0.0)):
+            subgoals = [{"attained": 0.0}, {"attained": 0.85}]
+            env = {"subgoals": ["left_door", "key"], "sticky": sticky}
+            result = {"env": env, "epsilon": epsilon, "episodes": 100, "per_subgoal": subgoals, "return_mean": 310.2}
+            result |= {"intervals": {"return_mean": [290.4, 330.0]}, "success_rate": 0.75, "steps_mean": 190.0}
+            (folder / f"evaluations/{name}.json").write_text(json.dumps(result))
+        return folder
+
+    def test_table_and_figures(self, run, folder):
+        assert run("runs=outputs", "out=results.md", "studies=montezuma") == "montezuma: runs 1, missing 5\n"
+        text = Path("results.md").read_text()
+        rows = [line for line in text.splitlines() if line.startswith("| v3")]
+        assert rows == [
+            "| v3 | 0 | 0k | 0 | 0 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
+            "| v3 | 0 | 0k | 0.05 | 0.25 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
+        ]
+        for name in ("montezuma", "montezuma_right", "montezuma_left", "montezuma_legs_v3"):
+            assert f"(results/{name}.png)" in text and (Path("results") / f"{name}.png").stat().st_size > 100
+
+    def test_an_archive_keeps_evaluations(self, run, folder):
+        run("runs=outputs", "out=a.md", "studies=montezuma", "keep=runs.tar.xz")
+        run("runs=runs.tar.xz", "out=b.md", "studies=montezuma")
+        assert Path("b.md").read_text() == Path("a.md").read_text().replace("(a/", "(b/")
+
+
 def test_runs_of_another_size_do_not_count(run, outputs):
     message = run("runs=outputs", "out=results.md", "studies=gridworld", "size=paper")
     assert message == "gridworld: runs 0, missing 18\n"

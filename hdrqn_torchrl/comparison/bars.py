@@ -64,7 +64,7 @@ def plot_bars(
                 if panel.column in group.estimates:
                     _draw_bar(place, position, group, group.estimates[panel.column], colors[group.label], lying)
             draw_references(place, task.groups, panel.column, colors, lying)
-            finish_panel(place, panel.column, lying)
+            finish_panel(place, panel, lying)
             _name_bars(place, [group.label for group in task.groups], lying, shown=not lying or place is row[0])
     unfinished = any(not run.summary for task in tasks for group in task.groups for run in group.runs)
     named = {} if lying else colors

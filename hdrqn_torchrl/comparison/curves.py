@@ -74,7 +74,7 @@ def plot_curves(
             for group in task.groups:
                 _draw_group(place, group, panel, scale, styles[group.label])
             draw_references(place, task.groups, panel.column, {label: style[0] for label, style in styles.items()})
-            finish_panel(place, panel.column)
+            finish_panel(place, panel)
             place.set_xlabel(unit if task is tasks[-1] else "")
             if log_x:
                 place.set_xscale("log")

@@ -24,6 +24,13 @@ class Panel(NamedTuple):
 
     column: str
     points: str | None = None
+    label: str | None = None
+    """Of its values; else what the column's name says."""
+
+    @property
+    def columns(self) -> set[str]:
+        """Those that it draws."""
+        return {self.column} if self.points is None else {self.column, self.points}
 
 
 PAPER = tuple(Panel(f"behaviour/{name}", f"greedy/{name}") for name in ("return", "intrinsic", "extrinsic", "steps"))
@@ -72,7 +79,7 @@ def with_data(panels: Sequence[Panel], tasks: Sequence[TaskResults]) -> list[Pan
         ValueError: if there are none.
     """
     columns = {column for task in tasks for group in task.groups for column in group.estimates}
-    if not (shown := [panel for panel in panels if columns & {*panel}]):
+    if not (shown := [panel for panel in panels if columns & panel.columns]):
         wanted = ", ".join(panel.column for panel in panels)
         raise ValueError(f"panels must name columns that a group has estimates for, got {wanted}; they have {columns}.")
     return shown
@@ -116,12 +123,12 @@ def distances(points: Estimate) -> Array:
     return np.stack([points.value - points.low, points.high - points.value]).clip(min=0)
 
 
-def finish_panel(place: Axes, column: str, lying: bool = False) -> None:
+def finish_panel(place: Axes, panel: Panel, lying: bool = False) -> None:
     """Label, scale and grid of a panel; ``lying``: its values go to the right."""
-    source, _, name = column.rpartition("/")
+    source, _, name = panel.column.rpartition("/")
     known = source in ("behaviour", "greedy") and name in _QUANTITIES
     values = place.xaxis if lying else place.yaxis
-    values.set_label_text(_QUANTITIES[name] if known else column)
+    values.set_label_text(panel.label or (_QUANTITIES[name] if known else panel.column))
     if known and name in _SHARES:
         (place.set_xlim if lying else place.set_ylim)(-0.03, 1.05)
         values.set_major_formatter(PercentFormatter(1.0))
