@@ -86,7 +86,7 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
         allowed_targets=settings.allowed_targets,
     )
     for exploration in agent.algorithm.explorations.values():
-        exploration.epsilon.fill_(settings.epsilon)
+        exploration.fixed = settings.epsilon
     greedy = settings.epsilon == 0.0
     observers = observers_of(agent.env)
     played = play(

@@ -71,6 +71,7 @@ def plot_legs_over_time(run: Run, names: Sequence[str], path: Path, *, windows: 
 def _draw_legs(axis: Axes, rates: NDArray[np.floating[Any]], notes: Sequence[str], names: Sequence[str]) -> AxesImage:
     """A matrix ``[G + 1, G]`` of shares, NaN where there were no options; ``notes`` stand below the numbers."""
     image = axis.imshow(rates, vmin=0.0, vmax=1.0, cmap="viridis", aspect="auto")
+    names = [name.replace("_", " ") for name in names]
     axis.set_xticks(range(len(names)), names, rotation=35, ha="right", rotation_mode="anchor", fontsize=8)
     axis.set_yticks(range(len(names) + 1), [*names, "start"], fontsize=8)
     for ((row, column), rate), note in zip(np.ndenumerate(rates), notes, strict=True):

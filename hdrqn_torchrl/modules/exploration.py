@@ -21,7 +21,7 @@ class EpsilonGreedy(nn.Module):
         start: epsilon at frame 0.
         end: epsilon from ``anneal_frames`` on.
         anneal_frames: length of the schedule in environment frames.
-        ladder: spread of epsilon over the environments, see :meth:`epsilons`; 0: all have the same.
+        ladder: spread of epsilon over the environments, epsilon to the power of 1 to 1 + ladder; 0: all have the same.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -54,6 +54,8 @@ class EpsilonGreedy(nn.Module):
         self.register_buffer("epsilon", torch.tensor(float(start)))
         self.held = False
         """Whether the schedule stands still."""
+        self.fixed: float | None = None
+        """One epsilon for all environments and subgoals in place of all others; for evaluations."""
 
     def step(self, frames: int) -> None:
         """Advances the schedule by ``frames`` environment frames, unless it is held."""
@@ -90,7 +92,16 @@ class EpsilonGreedy(nn.Module):
         return torch.where(explores, random, greedy)
 
     def epsilons(self, like: Tensor, subgoal: Tensor | None = None) -> Tensor:
-        """Epsilon of each environment, to be broadcast against choices ``[N, *]``; here the same for all subgoals.
+        """Epsilon of each environment, to be broadcast against choices ``[N, *]``.
+
+        Args:
+            like: choices.
+            subgoal: the subgoal ``[N]`` that each environment pursues.
+        """
+        return self._varied(like, subgoal) if self.fixed is None else torch.full_like(self.epsilon, self.fixed)
+
+    def _varied(self, like: Tensor, subgoal: Tensor | None) -> Tensor:
+        """As the schedule says; here the same for all subgoals.
 
         With a ladder, environment i has :math:`\\epsilon^{1 + \\alpha i / (N - 1)}` (Ape-X, Horgan et al., 2018).
         """

@@ -115,9 +115,8 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
         """Learns from a collected batch how often subgoals were reached."""
         self.success.observe(batch)
 
-    def epsilons(self, like: Tensor, subgoal: Tensor | None = None) -> Tensor:
-        """Epsilon of each environment, for the subgoal ``[N]`` that it pursues."""
-        scheduled = super().epsilons(like)
+    def _varied(self, like: Tensor, subgoal: Tensor | None) -> Tensor:
+        scheduled = super()._varied(like, subgoal)
         if subgoal is None:
             return scheduled
         return (scheduled * (1.0 - self.success.rates[subgoal])).clamp(min=self.end)

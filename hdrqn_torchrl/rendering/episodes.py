@@ -224,14 +224,14 @@ def _tell(scene: Scene, after: TensorDictBase) -> str:
 @contextmanager
 def _fixed_epsilon(explorations: dict[str, EpsilonGreedy], epsilon: float) -> Iterator[None]:
     """Sets the epsilon of every level, and sets it back."""
-    kept = {name: exploration.epsilon.clone() for name, exploration in explorations.items()}
+    kept = {name: exploration.fixed for name, exploration in explorations.items()}
     try:
         for exploration in explorations.values():
-            exploration.epsilon.fill_(epsilon)
+            exploration.fixed = epsilon
         yield
     finally:
         for name, exploration in explorations.items():
-            exploration.epsilon.copy_(kept[name])
+            exploration.fixed = kept[name]
 
 
 @contextmanager

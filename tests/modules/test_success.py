@@ -67,6 +67,14 @@ class TestSuccessEpsilonGreedy:
         for subgoal, epsilon in enumerate((1.0, 0.4, 0.1)):
             assert self.explored(exploration, subgoal) == pytest.approx(epsilon, abs=0.05)
 
+    def test_with_a_fixed_epsilon_neither_success_nor_environment_make_a_difference(self):
+        exploration = SuccessEpsilonGreedy(0.7, 0.05, ladder=7.0)
+        exploration.set_num_subgoals(2)
+        exploration.success.rates.copy_(torch.tensor([0.3, 1.0]))
+        exploration.fixed = 0.25
+        exploration.step(1000)
+        assert torch.allclose(exploration.epsilons(torch.zeros(4), torch.tensor([0, 1, 0, 1])), torch.tensor(0.25))
+
     def test_it_learns_from_batches_and_its_state_travels_with_the_weights(self):
         exploration, other = SuccessEpsilonGreedy(), SuccessEpsilonGreedy()
         for each in (exploration, other):
