@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.emulators import Emulators, Snapshot
-from hdrqn_torchrl.envs.montezuma_screen import DOOR_SCORE, SUBGOALS, Box, Ram, boxes_of, locate
+from hdrqn_torchrl.envs.montezuma_screen import DOOR_SCORE, DOORS, SUBGOALS, Box, Ram, boxes_of, locate
 from hdrqn_torchrl.envs.practice import PracticeStarts
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
 from hdrqn_torchrl.transforms import Window
@@ -33,10 +33,10 @@ class MontezumaEnv(EnvBase):
     down, in pixels), the agent's centre. :func:`make_montezuma` makes the agent's window of them.
 
     **Reward.** ``reward``: what the score rose by. ``extrinsic_reward``: 1 for the key and 1 for a door. Beside them:
-    ``attained`` ``[G]`` (the agent came into a subgoal's box in this step, alive and not falling; took the key; at a
-    reset: it begins there),
-    ``available`` ``[G]`` (subgoals worth choosing: not where the agent is; not the key once it is taken), ``hazard``
-    (the agent died in this step), ``success`` (a door was opened).
+    ``attained`` ``[G]`` (the agent came into a subgoal's box in this step, alive and not falling; took the key; opened
+    the door; at a reset: it begins there), ``available`` ``[G]`` (subgoals worth choosing: not where the agent is, but
+    for a door that it has the key for; not the key once it is taken), ``hazard`` (the agent died in this step),
+    ``success`` (a door was opened).
 
     **End of episode.** Terminated when a door opens, the room is left, the game is over or, if ``one_life``, the agent
     dies; truncated after ``max_steps`` steps.
@@ -109,6 +109,7 @@ class MontezumaEnv(EnvBase):
         self.locator, self.noops, self.practice, self.practice_steps = locator, noops, practice, practice_steps
         self.emulators = Emulators("montezuma_revenge", num_envs, frame_skip=frame_skip, sticky=sticky, threads=threads)
         self.ram = Ram(self.emulators.ram)
+        self._is_door = np.array([name in DOORS for name in self.subgoals])
         self.seen: tuple[int | None, int] | None = None
         """Side of the agent's window and of the image that is made of it, if that is known here; for pictures."""
         self.steps = np.zeros(num_envs, np.int64)
@@ -184,6 +185,7 @@ class MontezumaEnv(EnvBase):
         attained = here & ~self._inside
         if "key" in self.subgoals:
             attained[:, list(self.subgoals).index("key")] = took_key
+        attained |= here & opened[:, None] & self._is_door
         over = opened | ~self.ram.in_first_room()
         if self.one_life:
             over |= died
@@ -237,6 +239,7 @@ class MontezumaEnv(EnvBase):
         if "key" in self.subgoals:
             key = list(self.subgoals).index("key")
             available[:, key] = self.ram.key_is_there()
+        available |= self.ram.has_key()[:, None] & self._is_door
         return {keys.PIXELS: self.emulators.screens, keys.POSITION: self.positions(), keys.AVAILABLE: available}
 
     def _tensordict(self, entries: Mapping[str, NDArray]) -> TensorDict:

@@ -35,6 +35,9 @@ SUBGOALS = (
 )
 """The paper's six."""
 
+DOORS = ("left_door", "right_door")
+"""They open a step or two after the agent has come into their box with the key, if it goes on."""
+
 DOOR_SCORE = 300.0
 """What a door brings; the key brings 100."""
 

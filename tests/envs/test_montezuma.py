@@ -54,7 +54,7 @@ class TestRoute:
         env, steps = route
         inside = ~steps["available"]
         for g, name in enumerate(env.subgoals):
-            if name != "key":
+            if name not in ("key", "right_door"):
                 entered = inside[1:, g] & ~inside[:-1, g]
                 assert (steps["attained"][1:, g] == entered).all()
 
@@ -63,6 +63,20 @@ class TestRoute:
         key = list(env.subgoals).index("key")
         assert steps["available"][:75, key].all() and not steps["available"][75:, key].any()
         assert steps["attained"][:, key].nonzero().flatten().tolist() == [75]
+
+    def test_with_the_key_a_door_is_worth_choosing_where_the_agent_stands_at_it_and_opening_it_attains_it(self, route):
+        env, steps = route
+        door, other = (list(env.subgoals).index(f"{side}_door") for side in ("right", "left"))
+        assert steps["attained"][:, door].nonzero().flatten().tolist() == [165, 166]  # it came there, it opened
+        assert steps["available"][165, door] and steps["available"][165, other]
+        assert not steps["attained"][:, other].any()
+
+    def test_without_the_key_a_door_is_not_worth_choosing_where_the_agent_stands_at_it(self):
+        env = MontezumaEnv(1, seed=0)
+        steps = play(env, [3, 3, 11, *[3] * 15])
+        door = SUBGOALS.index("right_door")
+        came = steps["attained"][:, door].nonzero().flatten().tolist()
+        assert len(came) == 1 and not steps["available"][came[0], door]
 
     def test_position(self, route):
         _, steps = route
