@@ -155,8 +155,8 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
     """Figure, table and claims of a study as Markdown, and the claims' lines; draws its figures."""
     experiment = study.name if settings.size == "small" else f"paper/{study.name}"
     lines = [f"`python train.py -m experiment={experiment}`"]
-    if missing:
-        lines[0] += f" (runs that have not been made yet: {missing} of {missing + len(found)})"
+    if left := missing + sum(not run.entry.run.summary for _, run in found):
+        lines[0] += f" (runs that have not been made to their end yet: {left} of {missing + len(found)})"
     if not found:
         return lines[0], []
     beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]

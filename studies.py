@@ -118,7 +118,7 @@ STUDIES = (
         "How much the agent sees",
         by=("env.view",),
         rows="algo",
-        claims=tuple(Ordered("return", ["view=none", "view=5", "view=3"], row=row) for row in ("v1", "v2")),
+        claims=tuple(Ordered("return", ["view=null", "view=5", "view=3"], row=row) for row in ("v1", "v2")),
     ),
     Study(
         "gridworld",
