@@ -10,9 +10,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.isolation import isolated
 
 _SUMMED = {
     "return": keys.REWARD,
@@ -130,11 +131,12 @@ def play(
 ) -> TensorDictBase:
     """Plays episodes; the same seed gives the same ones.
 
+    Nothing changes in a training that goes on meanwhile (:func:`~hdrqn_torchrl.isolation.isolated`).
     Every environment contributes the same number of episodes: taking the first that finish would favour short
     ones. (TorchRL's ``Evaluator`` does that, hence this function.)
 
     Args:
-        env: environment with batch size ``[N]``.
+        env: environment with batch size ``[N]``, not that of a training: its episodes would be lost.
         policy: greedy under the default ``exploration_type``.
         episodes: number of episodes, rounded up to a multiple of N.
         seed: seed of the environment.
@@ -144,9 +146,7 @@ def play(
     Returns:
         One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)``.
     """
-    env.set_seed(seed)
-    with set_exploration_type(exploration_type), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with isolated(env, policy, seed=seed, exploration_type=exploration_type):
         rounds = [_play_once(env, policy, observers) for _ in range(-(-episodes // env.batch_size[0]))]
     return torch.cat(rounds, 0)  # type: ignore[return-value]
 

@@ -11,7 +11,9 @@ from waits import HostWaits
 
 from hdrqn_torchrl import learner as learner_module
 from hdrqn_torchrl.envs.grid_rules import GridState
+from hdrqn_torchrl.evaluation import evaluate
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
+from hdrqn_torchrl.transforms.window import resized
 
 EVERY = (*ALGORITHMS, "v3")
 FLAT = ("dqn", "drqn")
@@ -278,3 +280,30 @@ class TestEverythingIsOnOneDevice:
             assert self.devices(result) == {"meta"}
             norm = learner._watch_gradients(result["loss"])
             assert norm.device.type == learner.optimizer.found_inf.device.type == "meta"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+class TestOnAGPU:
+    def test_a_window_is_the_cpus_value_for_value(self):
+        for shape, size in (((16, 70, 70, 3), 44), ((2, 210, 160, 3), 44), ((3, 30, 33, 1), 84)):
+            screens = torch.randint(256, shape, dtype=torch.uint8)
+            assert torch.equal(resized(screens.cuda(), size).cpu(), resized(screens, size))
+
+    @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+    def test_an_evaluation_leaves_its_random_numbers_alone(self, kind):
+        env = small_env(8, device="cuda")
+        algorithm = build("v3", env)
+        torch.cuda.manual_seed(5)
+        state = torch.cuda.get_rng_state()
+        results = [
+            evaluate(algorithm.transform(env), algorithm.policy, episodes=8, exploration_type=kind) for _ in "ab"
+        ]
+        assert torch.equal(torch.cuda.get_rng_state(), state) and results[0] == results[1]
+
+    @pytest.mark.parametrize("name", EVERY)
+    def test_it_trains(self, name):
+        algorithm, env = make(name, small_env(8, max_steps=5, obstacle="teleport", device="cuda"))
+        for batch in collect(algorithm, env, 10, batches=2):
+            for learner in algorithm.learners.values():
+                learner.store(batch)
+                assert learner.update(learner.sample())["loss"].isfinite()

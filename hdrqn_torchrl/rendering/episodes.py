@@ -11,10 +11,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.isolation import isolated
 from hdrqn_torchrl.modules import EpsilonGreedy
 from hdrqn_torchrl.rendering.scenes import Scene, scene_of
 
@@ -130,15 +131,12 @@ def record_episodes(
         raise ValueError(f"episodes must be >= 1, got {episodes}; 3 show most of what an agent does.")
     if not 0.0 <= epsilon <= 1.0:
         raise ValueError(f"epsilon must lie in [0, 1], got {epsilon}; 0 plays greedily.")
-    env.set_seed(seed)
     exploration_type = ExplorationType.RANDOM if epsilon > 0 else ExplorationType.DETERMINISTIC
     with (
-        set_exploration_type(exploration_type),
-        torch.random.fork_rng(devices=[]),
+        isolated(env, algorithm.policy, seed=seed, exploration_type=exploration_type),
         _fixed_epsilon(algorithm.explorations, epsilon),
         _listening(algorithm.explorations) as heard,
     ):
-        torch.manual_seed(seed)
         rounds = (_play(env, algorithm.policy, heard, number + 1, episodes) for number in range(episodes))
         return [frame for played in rounds for frame in played]
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import cache
+from itertools import accumulate
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
@@ -10,6 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import on_host
 
 
 class Window(Transform):
@@ -101,8 +105,61 @@ def cut_out(pixels: Tensor, position: Tensor, view: int) -> Tensor:
 
 
 def resized(pixels: Tensor, size: int) -> Tensor:
-    """Screens ``[*, height, width, C]`` as square images ``[*, C, size, size]``, bilinear with antialiasing."""
+    """Screens ``[*, height, width, C]`` as square images ``[*, C, size, size]``, bilinear with antialiasing.
+
+    The same values on every device.
+    """
     batch = pixels.shape[:-3]
     images = pixels.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)
-    small = interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
+    if on_host(images):
+        small = interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
+    else:
+        small = interpolated(images, size)
     return small.contiguous().view(*batch, *small.shape[1:])
+
+
+def interpolated(images: Tensor, size: int) -> Tensor:
+    """What ``interpolate`` makes of uint8 images on a CPU, value for value, on any device.
+
+    Only a CPU has a kernel for them. It takes a weighted mean of the columns, then of the rows, as Pillow does: with
+    weights that are multiples of a power of two, and a result that is rounded. Such sums are exact in float64.
+
+    Args:
+        images: ``[N, C, height, width]`` uint8.
+        size: side of the result.
+
+    Returns:
+        ``[N, C, size, size]`` uint8.
+    """
+    across = _along_rows(images.double(), size)
+    return _along_rows(across.mT, size).mT.to(torch.uint8)
+
+
+def _along_rows(images: Tensor, size: int) -> Tensor:
+    """``[*, height, width]`` -> ``[*, height, size]``, whole numbers as float64."""
+    if images.shape[-1] == size:
+        return images
+    weights, unit = _weights(images.shape[-1], size, images.device)
+    return ((images @ weights + unit / 2) / unit).floor().clamp(0, 255)
+
+
+@cache
+def _weights(length: int, size: int, device: torch.device) -> tuple[Tensor, int]:
+    """How much of each of ``length`` pixels goes into each of ``size``, ``[length, size]`` float64, in parts of a unit.
+
+    A triangle around a pixel's centre, as wide as two pixels of the coarser grid. The unit is the largest power of two
+    for which weights fit into 16 bits.
+    """
+    scale = length / size
+    reach = max(scale, 1.0)
+    weights = torch.zeros(length, size, dtype=torch.float64)
+    for pixel in range(size):
+        centre = scale * (pixel + 0.5)
+        touched = range(max(int(centre - reach + 0.5), 0), min(int(centre + reach + 0.5), length))
+        triangle = [max(0.0, 1.0 - abs((place - centre + 0.5) * (1.0 / reach))) for place in touched]
+        *_, total = accumulate(triangle)  # in this order; sum() is more exact than the CPU's kernel
+        weights[touched.start : touched.stop, pixel] = torch.tensor(triangle, dtype=torch.float64) / total
+    largest, unit = weights.max().item(), 1
+    while unit < 2**22 and int(0.5 + largest * 2 * unit) < 2**15:
+        unit *= 2
+    return (weights * unit + 0.5).floor().to(device), unit

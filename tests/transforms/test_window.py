@@ -4,7 +4,7 @@ from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from hdrqn_torchrl.transforms.window import Window, cut_out, resized
+from hdrqn_torchrl.transforms.window import Window, cut_out, interpolated, resized
 
 SCREEN = torch.arange(6 * 8, dtype=torch.uint8).view(6, 8, 1)  # rows of 8
 
@@ -70,3 +70,33 @@ def test_specs_in_an_environment():
     env = TransformedEnv(MontezumaEnv(2, seed=0), Window(view=None, size=33))
     check_env_specs(env)
     assert env.observation_spec["observation"].shape == (2, 3, 33, 33)
+
+
+class TestInterpolated:
+    """On a GPU there is no kernel for bytes; the same numbers come out of matrix products."""
+
+    SIDES = ((70, 70), (210, 160), (44, 44), (44, 70), (30, 33), (5, 7), (1, 9), (100, 3), (88, 88), (45, 43))
+
+    @pytest.mark.parametrize("size", [44, 84, 33, 7, 100, 2, 1])
+    @pytest.mark.parametrize("channels", [1, 3, 4])
+    def test_it_is_what_a_cpu_makes_of_them(self, size, channels):
+        """Both memory layouts: PyTorch has a kernel for each. (That of layers side by side fails for size 1.)"""
+        for sides in self.SIDES:
+            images = torch.randint(256, (2, *sides, channels), dtype=torch.uint8).permute(0, 3, 1, 2)
+            images[0] = images[0] // 128 * 255  # black and white: the sharpest edges
+            found = interpolated(images, size)
+            assert found.dtype == torch.uint8
+            for layout in [images] if size == 1 else [images, images.contiguous()]:
+                assert (found == expected(layout, size)).all(), sides
+
+    def test_it_is_what_other_devices_get(self, monkeypatch):
+        screens = torch.randint(256, (2, 5, 70, 70, 3), dtype=torch.uint8)
+        images = resized(screens, 44)
+        monkeypatch.setattr("hdrqn_torchrl.transforms.window.on_host", lambda tensor: False)
+        monkeypatch.setattr("hdrqn_torchrl.transforms.window.interpolate", None)
+        again = resized(screens, 44)
+        assert (again == images).all() and again.is_contiguous() and again.shape == (2, 5, 3, 44, 44)
+
+
+def expected(images, size):
+    return torch.nn.functional.interpolate(images, (size, size), mode="bilinear", antialias=True, align_corners=False)
