@@ -6,6 +6,7 @@ import csv
 import fcntl
 import importlib
 import json
+import math
 import os
 import secrets
 import sys
@@ -51,7 +52,7 @@ class CSVLog:
         if new := [name for name in row if name not in self.columns]:
             self._widen(new)
         with self.path.open("a", newline="") as file:
-            csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(row)
+            csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(measured(row))
             file.flush()
             os.fsync(file.fileno())
         self.rows += 1
@@ -122,16 +123,17 @@ class RunLogger:
         self._last_greedy = ""
 
     def log(self, row: Row) -> None:
-        """Writes one log point; ``row["frames"]`` is its position."""
+        """Writes one log point; ``row["frames"]`` is its position, NaN a value that was not measured: an empty cell."""
         self.csv.write(row)
+        row = measured(row)
         frames = int(row["frames"])
         for logger in self.loggers:
             logger.log_metrics(row, step=frames)
         evaluated = "greedy/return" in row
         if evaluated:
             ceiling = f" of {row['greedy/ceiling']:.2f}" if "greedy/ceiling" in row else ""
-            success = row["greedy/success"]
-            self._last_greedy = f"greedy {row['greedy/return']:+.2f}{ceiling}, success {success:.0%}"
+            success = f", success {row['greedy/success']:.0%}" if "greedy/success" in row else ""
+            self._last_greedy = f"greedy {row['greedy/return']:+.2f}{ceiling}{success}"
         numbers = progress_line(row, self._last_greedy)
         self._progress.update(self._task, completed=frames, numbers=numbers)
         if evaluated and not self.console.is_terminal:
@@ -151,6 +153,16 @@ class RunLogger:
         self._progress.stop()
         for logger in self.loggers:
             logger.close()
+
+
+def measured(row: Row) -> Row:
+    """The values that are numbers; a mean over nothing is NaN, and is none.
+
+    Examples:
+        >>> measured({"frames": 8, "legs/start_to_0": float("nan")})
+        {'frames': 8}
+    """
+    return {name: value for name, value in row.items() if math.isfinite(value)}
 
 
 def progress_line(row: Row, greedy: str) -> str:

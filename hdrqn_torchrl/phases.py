@@ -79,13 +79,16 @@ class Phases:
                 self._hold(False)
 
     def metrics(self) -> dict[str, float]:
-        """The phase, the success of each subgoal's last options, and of each leg since the last call."""
+        """Phase, success of each subgoal's last options, and of each leg since :meth:`clear` (NaN where none ended)."""
         rates = {f"phase/success_{index}": rate for index, rate in enumerate(self.success.rates.tolist())}
         for origin, row in enumerate(self.legs.rates.tolist()):
             name = "start" if origin == self.legs.num_subgoals else origin
             rates |= {f"legs/{name}_to_{target}": rate for target, rate in enumerate(row)}
-        self.legs.clear()
         return {"phase": self.phase, **rates}
+
+    def clear(self) -> None:
+        """Begins the next row's count of legs. Call it when the last one is written, no sooner."""
+        self.legs.clear()
 
     def _hold(self, held: bool) -> None:
         self.exploration.held = held

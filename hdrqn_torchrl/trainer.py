@@ -184,8 +184,14 @@ class Trainer:
             if best := result["return_mean"] > self.best_return:
                 self.best_return = result["return_mean"]
         self.logger.log(row)
-        self._window = _Window(self.frames)
+        self._begin_row()
         return best
+
+    def _begin_row(self) -> None:
+        """Starts counting anew; only now that a row is on the disk: a stop before would lose what was counted."""
+        self._window = _Window(self.frames)
+        if self.algorithm.phases is not None:
+            self.algorithm.phases.clear()
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint of the whole training, unless nothing happened since the last one.

@@ -40,6 +40,13 @@ class TestCSVLog:
         ]
         assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
 
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+    def test_what_was_not_measured_is_an_empty_cell(self, tmp_path, value):
+        log = CSVLog(tmp_path / "metrics.csv")
+        log.write({"frames": 1, "legs/start_to_0": value, "loss": 0.5})
+        log.write({"frames": 2, "legs/start_to_0": 0.25, "loss": 0.5})
+        assert log.path.read_text() == "frames,legs/start_to_0,loss\n1,,0.5\n2,0.25,0.5\n"
+
     def test_the_order_of_a_rows_entries_does_not_matter(self, tmp_path):
         log = CSVLog(tmp_path / "metrics.csv")
         log.write({"a": 1, "b": 2})

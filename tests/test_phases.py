@@ -67,6 +67,8 @@ class TestPhases:
         assert metrics["phase"] == 1 and metrics["phase/success_1"] == 0.5
         assert metrics["legs/start_to_0"] == metrics["legs/0_to_1"] == 1.0
         assert metrics["legs/1_to_0"] == 0.0
+        assert phases.metrics() == pytest.approx(metrics, nan_ok=True)  # to look takes nothing away
+        phases.clear()
         assert all(math.isnan(value) for name, value in phases.metrics().items() if name.startswith("legs"))
 
     def test_the_meta_level_must_choose_at_random(self):

@@ -12,6 +12,7 @@ from helpers import check_same, check_same_checkpoint, make_training, seed_every
 from hdrqn_torchrl import checkpoint
 from hdrqn_torchrl.checkpoint import Checkpoints
 from hdrqn_torchrl.interruption import Interrupted
+from hdrqn_torchrl.phases import PhaseOne
 
 BATCH = 32  # frames; see make_training
 TRAININGS = {
@@ -29,6 +30,7 @@ TRAININGS = {
         learner={"trace_decay": 0.5},
         options={"sub_hindsight": True, "meta_hindsight": True, "meta_input_time": "after_last_observation"},
     ),
+    "v2-phases": partial(make_training, name="v2", options={"phase_one": PhaseOne(max_frames=64)}),
     "v3": partial(make_training, name="v3"),
     "v1-r2d2": partial(
         make_training, name="v1", learner={"stored_state": True, "priority_exponent": 0.9, "slice_len": 2}
@@ -148,6 +150,7 @@ def memory_for_disk():
 FEW = ("between two updates", "in the middle of options", "with full memories")
 PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
 PAIRS += [(training, cut) for training in ("v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
+PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of metrics", *FEW[1:])]
 PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole"))]
 PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
 
