@@ -6,7 +6,8 @@
     checkpoint      best (default), last, or the path of a checkpoint or weights file
     episodes        episodes to play, rounded up to a multiple of num_envs (1000)
     num_envs        worlds that are played at the same time (250)
-    seed            of the worlds; the same seed gives the same episodes (1_000_001, that of a run's own summary)
+    seed            of the worlds (default: that of the run's own summary, evaluation.seed + 1). With the same seed,
+                    num_envs and env.KEY episode i begins in the same world for every agent
     epsilon         probability of a random choice, at each level (0: greedy)
     env.KEY         setting of the task that shall differ from the run's, e.g. env.view=3 env.layout=four_rooms
     out             file to write the object to as well
@@ -43,7 +44,7 @@ class Settings:
     checkpoint: str = "best"
     episodes: int = 1000
     num_envs: int = 250
-    seed: int = 1_000_001
+    seed: int | None = None
     epsilon: float = 0.0
     env: dict[str, Any] = field(default_factory=dict)
     out: str | None = None
@@ -57,6 +58,8 @@ def main(settings: Settings) -> None:
     for name, least in (("episodes", 1), ("num_envs", 1), ("threads", 1)):
         if getattr(settings, name) < least:
             raise SettingsError(f"{name} must be >= {least}, got {getattr(settings, name)}.")
+    if settings.seed is not None and settings.seed < 0:
+        raise SettingsError(f"seed must be >= 0, got {settings.seed}; without it the run's summary has them.")
     if not 0.0 <= settings.epsilon <= 1.0:
         raise SettingsError(f"epsilon must lie in [0, 1], got {settings.epsilon}; 0 is greedy.")
     result = json.dumps(evaluate_run(settings), indent=2)
@@ -88,12 +91,13 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
     for exploration in agent.algorithm.explorations.values():
         exploration.fixed = settings.epsilon
     greedy = settings.epsilon == 0.0
+    seed = agent.config.evaluation.seed + 1 if settings.seed is None else settings.seed
     observers = observers_of(agent.env)
     played = play(
         agent.env,
         agent.algorithm.policy,
         episodes=settings.episodes,
-        seed=settings.seed,
+        seed=seed,
         exploration_type=ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM,
         observers=list(observers.values()),
     )
@@ -104,7 +108,7 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
         "run": settings.run,
         "checkpoint": settings.checkpoint,
         "env": OmegaConf.to_container(agent.config.env, resolve=True),
-        "seed": settings.seed,
+        "seed": seed,
         "epsilon": settings.epsilon,
         **summarise(played),
         **({"legs": legs_of(observers["legs"])} if "legs" in observers else {}),

@@ -129,26 +129,45 @@ def play(
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     observers: Sequence[Observer] = (),
 ) -> TensorDictBase:
-    """Plays episodes; the same seed gives the same ones.
+    """Plays episodes, in rounds of one in each environment.
 
     Nothing changes in a training that goes on meanwhile (:func:`~hdrqn_torchrl.isolation.isolated`).
     Every environment contributes the same number of episodes: taking the first that finish would favour short
     ones. (TorchRL's ``Evaluator`` does that, hence this function.)
 
+    Before each round environment and random numbers are seeded anew, from ``seed`` and the round's number. So episode i
+    begins in the same world for every policy, whatever was played before, and differences between two policies can be
+    taken episode by episode. Which world that is depends on ``seed`` and N. What an environment draws later in an
+    episode (sticky actions, obstacles that move) is as alike as it makes it.
+
     Args:
         env: environment with batch size ``[N]``, not that of a training: its episodes would be lost.
         policy: greedy under the default ``exploration_type``.
         episodes: number of episodes, rounded up to a multiple of N.
-        seed: seed of the environment.
+        seed: of the first round; those of the others are derived from it.
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
         observers: are shown every step, those after the end of an environment's last episode as well.
 
     Returns:
         One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)``.
     """
-    with isolated(env, policy, seed=seed, exploration_type=exploration_type):
-        rounds = [_play_once(env, policy, observers) for _ in range(-(-episodes // env.batch_size[0]))]
+    rounds = []
+    for number in range(-(-episodes // env.batch_size[0])):
+        with isolated(env, policy, seed=seed_of_round(seed, number), exploration_type=exploration_type):
+            rounds.append(_play_once(env, policy, observers))
     return torch.cat(rounds, 0)  # type: ignore[return-value]
+
+
+def seed_of_round(seed: int, number: int) -> int:
+    """Seed of a round of episodes: ``seed`` itself for the first; neighbouring seeds share none of the others.
+
+    Examples:
+        >>> seed_of_round(7, 0), seed_of_round(7, 1) == seed_of_round(8, 1)
+        (7, False)
+    """
+    if number == 0:
+        return seed
+    return int(numpy.random.SeedSequence([seed % 2**64, number]).generate_state(1)[0]) >> 1  # 31 bits suit every env
 
 
 def evaluate(

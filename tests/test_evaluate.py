@@ -39,6 +39,7 @@ def test_it_finds_what_the_run_found_at_its_end(run, call):
     summary = json.loads((run / "summary.json").read_text())
     for name in ("return_mean", "intrinsic_mean", "success_rate", "steps_mean", "episodes", "ceiling"):
         assert result[name] == summary[name], name
+    assert result["seed"] == 1_000_001  # not the 1_000_000 of the evaluations that chose the best checkpoint
 
 
 def test_what_it_says(call):
@@ -85,6 +86,7 @@ def test_the_object_can_be_written_to_a_file(call, tmp_path):
     [
         (["episodes=0"], "episodes must be >= 1, got 0"),
         (["num_envs=0"], "num_envs must be >= 1, got 0"),
+        (["seed=-1"], "seed must be >= 0, got -1"),
         (["epsilon=2"], r"epsilon must lie in \[0, 1\], got 2"),
         (["episods=3"], "episods"),
         (["env.veiw=3"], "env.veiw must be one of"),

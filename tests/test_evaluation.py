@@ -1,11 +1,11 @@
 import pytest
 import torch
-from helpers import RIGHT, build, collect, small_env, subgoal_env
+from helpers import LEFT, RIGHT, build, collect, small_env, subgoal_env
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
 
-from hdrqn_torchrl.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, summarise
+from hdrqn_torchrl.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round, summarise
 
 PAIR = ("####", "#  #", "####")  # agent and goal side by side
 TRACKED = ("return", "extrinsic", "intrinsic", "success", "in_order", "steps")
@@ -15,8 +15,12 @@ def pair_env(num_envs):
     return small_env(num_envs, layout=PAIR, num_obstacles=0, num_goals=1, max_steps=3)
 
 
+def always(action):
+    return TensorDictModule(lambda observation: torch.full(observation.shape[:1], action), ["observation"], ["action"])
+
+
 def always_right():
-    return TensorDictModule(lambda observation: torch.full(observation.shape[:1], RIGHT), ["observation"], ["action"])
+    return always(RIGHT)
 
 
 class TestEvaluate:
@@ -80,6 +84,41 @@ class TestEvaluate:
         torch.rand(7)
         env.rollout(5)
         assert evaluate(env, policy, episodes=16, seed=3) == first != other
+
+    def test_every_policy_meets_the_same_worlds_in_every_round_however_long_its_episodes_are(self, monkeypatch):
+        """Going right or left in a corridor: who finds the goal at once is done sooner, and resets more often."""
+        env, starts = pair_env(4), []
+        reset = env.reset
+
+        def recorded(*tensordict, **options):
+            if not tensordict:  # all worlds at once: a round begins
+                starts.append(reset(**options))
+                return starts[-1].clone()
+            return reset(*tensordict, **options)
+
+        monkeypatch.setattr(env, "reset", recorded)
+
+        def worlds_and_steps(direction, seed=7):
+            starts.clear()
+            steps = play(env, always(direction), episodes=40, seed=seed)["steps"]
+            return torch.stack([start["observation"] for start in starts]), steps
+
+        (right, right_steps), (left, left_steps) = worlds_and_steps(RIGHT), worlds_and_steps(LEFT)
+        assert len(right) == 10 and (right == left).all() and (right_steps != left_steps).any()
+        assert len(right.flatten(1).unique(dim=0)) > 5  # rounds differ
+        following, _ = worlds_and_steps(RIGHT, seed=8)
+        assert (following != right).flatten(1).any(1).float().mean() > 0.5
+
+    def test_the_first_round_has_the_seed_that_was_given(self):
+        env = pair_env(8)
+        env.set_seed(3)
+        on_the_right = env.reset()["observation"][:, 1, 2] == 3
+        assert (play(env, always(RIGHT), episodes=8, seed=3)["success"].bool() == on_the_right).all()
+
+    def test_rounds_of_neighbouring_seeds_share_nothing(self):
+        seeds = [seed_of_round(seed, number) for seed in range(1_000_000, 1_000_020) for number in range(20)]
+        assert len(set(seeds)) == 400 and all(0 <= seed < 2**31 for seed in seeds)
+        assert isinstance(seed_of_round(-5, 1), int)
 
     def test_the_training_streams_of_random_numbers_go_on_untouched(self, agent):
         env, policy = agent

@@ -68,14 +68,15 @@ class Emulators:
         rom = roms.get_rom_path(game)
         if rom is None:
             raise ValueError(f"game must be one that ale-py has a ROM of, got {game!r}.")
-        self._rom = rom
+        self._rom, self._sticky = rom, sticky
         self._emulators: list[ALEInterface] = []
         for _ in range(number):
             emulator = ALEInterface()
             emulator.setInt("frame_skip", frame_skip)
             emulator.setFloat("repeat_action_probability", sticky)
+            emulator.setInt("random_seed", 0)
+            emulator.loadROM(rom)
             self._emulators.append(emulator)
-        self.seed(0)
         height, width = self._emulators[0].getScreenDims()
         self.ram: Bytes = np.zeros((number, self._emulators[0].getRAMSize()), np.uint8)
         self.screens: Bytes = np.zeros((number, height, width, 3), np.uint8)
@@ -87,9 +88,12 @@ class Emulators:
         return len(self._emulators)
 
     def seed(self, seed: int) -> None:
-        """Starts all games anew; sticky actions are drawn from generators of their own."""
-        for index, emulator in enumerate(self._emulators):
-            emulator.setInt("random_seed", (seed + index) % 2**31)
+        """Seeds the sticky actions, which each emulator draws from a generator of its own; games begin anew then."""
+        if not self._sticky:
+            return  # nothing else is drawn, and loading takes a tenth of a second each
+        own = np.random.SeedSequence(seed).generate_state(len(self)) >> 1  # 31 bits
+        for emulator, its_seed in zip(self._emulators, own.tolist(), strict=True):
+            emulator.setInt("random_seed", its_seed)
             emulator.loadROM(self._rom)
 
     def _first_moment(self) -> Snapshot:

@@ -142,8 +142,10 @@ class MontezumaEnv(EnvBase):
         self.done_spec = episode_ends(n, device=device)
 
     def _set_seed(self, seed: int | None) -> None:
+        """Starts everything over, practice as well: what is drawn from here on depends on ``seed`` alone."""
         self._generator = np.random.default_rng(seed or 0)
         self.emulators.seed(seed or 0)
+        self._practice_starts, self.total_steps = PracticeStarts(), 0
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

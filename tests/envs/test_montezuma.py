@@ -163,8 +163,31 @@ class TestEpisodes:
         def positions(seed):
             return play(MontezumaEnv(2, seed=seed, sticky=0.25), [3, 4] * 10)["position"]
 
-        assert (positions(1) == positions(1)).all()
-        assert (positions(1) != positions(2)).any()
+        first, second = positions(1), positions(2)
+        assert (first == positions(1)).all()
+        assert (first != second).any()
+
+    def test_no_emulator_draws_what_another_one_drew_under_the_seed_before(self):
+        """Evaluations that choose a checkpoint have one seed, those that report it the next."""
+        env = MontezumaEnv(3, sticky=0.25)
+
+        def paths(seed):
+            env.set_seed(seed)
+            tensordict, seen = env.reset(), []
+            for step in range(60):
+                tensordict = step_mdp(env.step(tensordict.set("action", torch.full((3,), 3 + step % 2))))
+                seen.append(tensordict["position"])
+            return torch.stack(seen, 1).flatten(1).unbind(0)
+
+        assert not any((one == other).all() for one in paths(1) for other in paths(2))
+
+    def test_a_seed_starts_over_whatever_came_before(self):
+        env = MontezumaEnv(2, seed=3, noops=30, practice=1.0, practice_steps=100)
+        first = env.reset()["pixels"]
+        play(env, ROUTE["actions"][:7])
+        assert env.total_steps == 14 and (env.reset()["position"] != torch.tensor([79.5, 82.5])).any()
+        env.set_seed(3)
+        assert (env.reset()["pixels"] == first).all() and env.total_steps == 0
 
     def test_practice_begins_where_a_subgoal_was_attained(self):
         env = MontezumaEnv(1, seed=0, practice=1.0)
