@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import importlib
 import json
 import math
@@ -19,6 +18,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torchrl.record.loggers.common import Logger
+
+from hdrqn_torchrl.locking import lock
 
 Row = dict[str, float]
 
@@ -273,8 +274,7 @@ def _one_at_a_time(tracking_uri: str) -> Iterator[None]:
         return
     path = Path(tracking_uri.removeprefix("sqlite:///"))
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.with_name(f"{path.name}.lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with lock(path.with_name(f"{path.name}.lock"), patience_seconds=600.0):
         yield
 
 

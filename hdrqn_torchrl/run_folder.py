@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from torchrl.envs import EnvBase
@@ -14,6 +13,7 @@ from torchrl.envs import EnvBase
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.envs.ceilings import ceiling
 from hdrqn_torchrl.envs.scripted import PLAYERS
+from hdrqn_torchrl.locking import InUse, lock
 from hdrqn_torchrl.plotting import plot_run, read_metrics
 from hdrqn_torchrl.trainer import Trainer
 
@@ -59,22 +59,30 @@ def write_whole(path: Path, text: str) -> None:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Keeps other processes from training in the same folder; the lock ends with the process, however it ends.
+def locked(folder: Path, *, patience_seconds: float = 0.0, tell: Callable[[str], None] | None = None) -> Iterator[None]:
+    """Keeps other processes from training in the same folder (:func:`~hdrqn_torchrl.locking.lock`).
+
+    Args:
+        folder: run folder; created if it is not there.
+        patience_seconds: how long to wait for another process that trains there.
+        tell: called once, with a sentence, if there is one to wait for.
 
     Raises:
         ValueError: if another process trains there, or nothing can be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / ".lock").open("w")
-    except OSError as error:
-        raise ValueError(f"the run folder must be writable, got {folder} ({error}); choose another one.") from error
-    with file:
+
+    def tell_of(owner: str) -> None:
+        if tell is not None:
+            tell(f"{folder} is in use: waiting for {owner}, which is training there")
+
+    with ExitStack() as stack:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ValueError(f"{folder} is in use: another process is training there; wait or stop it.") from error
+            folder.mkdir(parents=True, exist_ok=True)
+            stack.enter_context(lock(folder / ".lock", patience_seconds=patience_seconds, tell=tell_of))
+        except InUse as error:
+            raise ValueError(f"{folder} is in use: {error.owner} is training there; wait or stop it.") from error
+        except OSError as error:
+            raise ValueError(f"the run folder must be writable, got {folder} ({error}); choose another one.") from error
         yield
 
 

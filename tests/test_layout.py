@@ -10,7 +10,7 @@ import hdrqn_torchrl
 ORDER = (
     "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "collectors", "precision", "finite",
     "learner", "legs", "phases", "algorithms", "isolation", "evaluation", "serialization", "checkpoint", "interruption",
-    "logging", "results",
+    "locking", "logging", "results",
     "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent

@@ -68,7 +68,9 @@ class TestLocked:
         while not (tmp_path / "run" / "held").exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         with (
-            pytest.raises(ValueError, match=r"run is in use: another process is training there; wait or stop it\."),
+            pytest.raises(
+                ValueError, match=rf"run is in use: process {process.pid} on .* is training there; wait or stop it\."
+            ),
             locked(tmp_path / "run"),
         ):
             raise AssertionError("both are in")
