@@ -11,6 +11,7 @@ from hdrqn_torchrl.envs.scripted import (
     play_episodes,
     scripted_ceiling,
 )
+from hdrqn_torchrl.envs.task import Task, task_of
 
 __all__ = [
     "EgocentricSearch",
@@ -18,9 +19,11 @@ __all__ = [
     "MontezumaEnv",
     "MultiGoalGridEnv",
     "PerfectMemorySearch",
+    "Task",
     "UniformRandom",
     "ceiling",
     "make_montezuma",
     "play_episodes",
     "scripted_ceiling",
+    "task_of",
 ]

@@ -12,7 +12,7 @@ from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
 from hdrqn_torchrl.envs.scripted import PlayerName, scripted_ceiling
 
 
-class Task(NamedTuple):
+class StandardTask(NamedTuple):
     """A standard task, two obstacles that stay. ``view`` is None for players that do not look through a window."""
 
     player: PlayerName
@@ -24,39 +24,39 @@ class Task(NamedTuple):
 
 _LOOKING: tuple[PlayerName, ...] = ("memory", "egocentric")  # players that look through the window
 MEASURED_EPISODES = 20_000
-MEASURED: dict[Task, tuple[float, float, float]] = {  # return_mean, success_rate, steps_mean
-    Task("planner", "open", 2, 50, None): (2.000, 1.0000, 12.1),
-    Task("memory", "open", 2, 50, None): (2.000, 1.0000, 12.1),
-    Task("memory", "open", 2, 50, 5): (2.000, 1.0000, 15.5),
-    Task("memory", "open", 2, 50, 3): (2.000, 0.9997, 22.5),
-    Task("egocentric", "open", 2, 50, None): (2.000, 1.0000, 12.1),
-    Task("egocentric", "open", 2, 50, 5): (2.000, 1.0000, 16.5),
-    Task("egocentric", "open", 2, 50, 3): (1.994, 0.9946, 25.1),
-    Task("random", "open", 2, 50, None): (-0.910, 0.0315, 48.8),
-    Task("planner", "open", 3, 50, None): (3.000, 1.0000, 18.1),
-    Task("memory", "open", 3, 50, None): (3.000, 1.0000, 18.1),
-    Task("memory", "open", 3, 50, 5): (3.000, 0.9999, 21.8),
-    Task("memory", "open", 3, 50, 3): (2.991, 0.9913, 29.6),
-    Task("egocentric", "open", 3, 50, None): (3.000, 1.0000, 18.1),
-    Task("egocentric", "open", 3, 50, 5): (3.000, 0.9998, 23.0),
-    Task("egocentric", "open", 3, 50, 3): (2.956, 0.9624, 32.2),
-    Task("random", "open", 3, 50, None): (-0.961, 0.0022, 49.8),
-    Task("planner", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
-    Task("memory", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
-    Task("memory", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
-    Task("memory", "four_rooms", 2, 50, 3): (1.949, 0.9907, 25.2),
-    Task("egocentric", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
-    Task("egocentric", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
-    Task("egocentric", "four_rooms", 2, 50, 3): (1.947, 0.9889, 26.0),
-    Task("random", "four_rooms", 2, 50, None): (-1.170, 0.0231, 49.0),
-    Task("planner", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
-    Task("memory", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
-    Task("memory", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
-    Task("memory", "four_rooms", 3, 100, 3): (2.882, 0.9892, 34.1),
-    Task("egocentric", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
-    Task("egocentric", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
-    Task("egocentric", "four_rooms", 3, 100, 3): (2.882, 0.9892, 35.1),
-    Task("random", "four_rooms", 3, 100, None): (-2.566, 0.0056, 98.8),
+MEASURED: dict[StandardTask, tuple[float, float, float]] = {  # return_mean, success_rate, steps_mean
+    StandardTask("planner", "open", 2, 50, None): (2.000, 1.0000, 12.1),
+    StandardTask("memory", "open", 2, 50, None): (2.000, 1.0000, 12.1),
+    StandardTask("memory", "open", 2, 50, 5): (2.000, 1.0000, 15.5),
+    StandardTask("memory", "open", 2, 50, 3): (2.000, 0.9997, 22.5),
+    StandardTask("egocentric", "open", 2, 50, None): (2.000, 1.0000, 12.1),
+    StandardTask("egocentric", "open", 2, 50, 5): (2.000, 1.0000, 16.5),
+    StandardTask("egocentric", "open", 2, 50, 3): (1.994, 0.9946, 25.1),
+    StandardTask("random", "open", 2, 50, None): (-0.910, 0.0315, 48.8),
+    StandardTask("planner", "open", 3, 50, None): (3.000, 1.0000, 18.1),
+    StandardTask("memory", "open", 3, 50, None): (3.000, 1.0000, 18.1),
+    StandardTask("memory", "open", 3, 50, 5): (3.000, 0.9999, 21.8),
+    StandardTask("memory", "open", 3, 50, 3): (2.991, 0.9913, 29.6),
+    StandardTask("egocentric", "open", 3, 50, None): (3.000, 1.0000, 18.1),
+    StandardTask("egocentric", "open", 3, 50, 5): (3.000, 0.9998, 23.0),
+    StandardTask("egocentric", "open", 3, 50, 3): (2.956, 0.9624, 32.2),
+    StandardTask("random", "open", 3, 50, None): (-0.961, 0.0022, 49.8),
+    StandardTask("planner", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
+    StandardTask("memory", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
+    StandardTask("memory", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
+    StandardTask("memory", "four_rooms", 2, 50, 3): (1.949, 0.9907, 25.2),
+    StandardTask("egocentric", "four_rooms", 2, 50, None): (1.959, 1.0000, 14.3),
+    StandardTask("egocentric", "four_rooms", 2, 50, 5): (1.958, 0.9999, 17.7),
+    StandardTask("egocentric", "four_rooms", 2, 50, 3): (1.947, 0.9889, 26.0),
+    StandardTask("random", "four_rooms", 2, 50, None): (-1.170, 0.0231, 49.0),
+    StandardTask("planner", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
+    StandardTask("memory", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
+    StandardTask("memory", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
+    StandardTask("memory", "four_rooms", 3, 100, 3): (2.882, 0.9892, 34.1),
+    StandardTask("egocentric", "four_rooms", 3, 100, None): (2.885, 0.9892, 21.6),
+    StandardTask("egocentric", "four_rooms", 3, 100, 5): (2.882, 0.9892, 25.6),
+    StandardTask("egocentric", "four_rooms", 3, 100, 3): (2.882, 0.9892, 35.1),
+    StandardTask("random", "four_rooms", 3, 100, None): (-2.566, 0.0056, 98.8),
 }
 
 
@@ -81,17 +81,17 @@ def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, 
         >>> ceiling("memory", MultiGoalGridEnv(layout="four_rooms", num_goals=3, max_steps=100, view=3))["episodes"]
         20000
     """
-    task = env.task
+    task = env.settings
     if task["obstacle"] == "stay" and task["num_obstacles"] == 2 and isinstance(task["layout"], str):
         view = task["view"] if player in _LOOKING else None
-        figures = MEASURED.get(Task(player, task["layout"], task["num_goals"], task["max_steps"], view))
+        figures = MEASURED.get(StandardTask(player, task["layout"], task["num_goals"], task["max_steps"], view))
         if figures is not None:
             names = ("return_mean", "success_rate", "steps_mean")
             return dict(zip(names, figures, strict=True)) | {"episodes": MEASURED_EPISODES}
     return scripted_ceiling(player, **task, episodes=episodes, seed=seed)
 
 
-def standard_tasks() -> Iterator[Task]:
+def standard_tasks() -> Iterator[StandardTask]:
     """Every row of :data:`MEASURED`."""
     for layout, num_goals, max_steps in (
         ("open", 2, 50),
@@ -99,14 +99,14 @@ def standard_tasks() -> Iterator[Task]:
         ("four_rooms", 2, 50),
         ("four_rooms", 3, 100),
     ):
-        yield Task("planner", layout, num_goals, max_steps, None)
+        yield StandardTask("planner", layout, num_goals, max_steps, None)
         for player in _LOOKING:
             for view in (None, 5, 3):
-                yield Task(player, layout, num_goals, max_steps, view)
-        yield Task("random", layout, num_goals, max_steps, None)
+                yield StandardTask(player, layout, num_goals, max_steps, view)
+        yield StandardTask("random", layout, num_goals, max_steps, None)
 
 
-def measure(task: Task, episodes: int, seed: int = 0) -> dict[str, float]:
+def measure(task: StandardTask, episodes: int, seed: int = 0) -> dict[str, float]:
     """Simulates a standard task; see :func:`~hdrqn_torchrl.envs.scripted.scripted_ceiling`."""
     player, layout, num_goals, max_steps, view = task
     return scripted_ceiling(

@@ -16,6 +16,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid_rules import ACTIONS, GridRules, GridState, StepEvents
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
+from hdrqn_torchrl.envs.task import Task, goals_in_order
 
 
 class MultiGoalGridEnv(EnvBase):
@@ -81,7 +82,7 @@ class MultiGoalGridEnv(EnvBase):
             layout, num_goals=num_goals, view=view, obstacle=obstacle, num_obstacles=num_obstacles, device=device
         )
         self.num_envs, self.max_steps = num_envs, max_steps
-        self.task: dict[str, Any] = {
+        self.settings: dict[str, Any] = {
             "layout": layout,
             "num_goals": num_goals,
             "view": view,
@@ -89,6 +90,13 @@ class MultiGoalGridEnv(EnvBase):
             "obstacle": obstacle,
             "num_obstacles": num_obstacles,
         }
+        self.task = Task(  # a goal pays 1 at most
+            max_steps=max_steps,
+            largest_return=float(num_goals),
+            largest_extrinsic_return=float(num_goals),
+            smallest_extrinsic_return=0.0,
+            in_order=goals_in_order(num_goals),
+        )
         self._make_specs()
         self._generator = torch.Generator(device)
         self.set_seed(torch.randint(2**31, ()).item() if seed is None else seed)

@@ -17,6 +17,7 @@ from hdrqn_torchrl.envs.emulators import Emulators, Snapshot
 from hdrqn_torchrl.envs.montezuma_screen import DOOR_SCORE, DOORS, SUBGOALS, Box, Ram, boxes_of, locate
 from hdrqn_torchrl.envs.practice import PracticeStarts
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
+from hdrqn_torchrl.envs.task import Task
 from hdrqn_torchrl.transforms import Window
 
 ALL_ACTIONS = tuple(range(18))
@@ -110,6 +111,9 @@ class MontezumaEnv(EnvBase):
         self.emulators = Emulators("montezuma_revenge", num_envs, frame_skip=frame_skip, sticky=sticky, threads=threads)
         self.ram = Ram(self.emulators.ram)
         self._is_door = np.array([name in DOORS for name in self.subgoals])
+        self.task = Task(  # key and door; the score counts 100 and 300 for them
+            max_steps=max_steps, largest_return=400.0, largest_extrinsic_return=2.0, smallest_extrinsic_return=0.0
+        )
         self.seen: tuple[int | None, int] | None = None
         """Side of the agent's window and of the image that is made of it, if that is known here; for pictures."""
         self.steps = np.zeros(num_envs, np.int64)

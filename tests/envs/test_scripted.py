@@ -11,7 +11,7 @@ from hdrqn_torchrl.envs import (
     play_episodes,
     scripted_ceiling,
 )
-from hdrqn_torchrl.envs.ceilings import MEASURED, MEASURED_EPISODES, Task, measure, standard_tasks
+from hdrqn_torchrl.envs.ceilings import MEASURED, MEASURED_EPISODES, StandardTask, measure, standard_tasks
 
 TASKS = {
     ("open", 2): {"layout": "open", "num_goals": 2, "max_steps": 50},
@@ -199,7 +199,7 @@ def test_the_table_covers_the_standard_tasks():
 
 def test_ceiling_looks_standard_tasks_up_and_simulates_others():
     known = ceiling("memory", MultiGoalGridEnv(layout="four_rooms", num_goals=3, max_steps=100, view=3))
-    row = MEASURED[Task("memory", "four_rooms", 3, 100, 3)]
+    row = MEASURED[StandardTask("memory", "four_rooms", 3, 100, 3)]
     assert (known["return_mean"], known["success_rate"], known["steps_mean"]) == row
     assert known["episodes"] == MEASURED_EPISODES
     for player in ("memory", "egocentric"):

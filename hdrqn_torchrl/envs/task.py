@@ -1,0 +1,119 @@
+"""What a task tells about itself, so that nothing has to be guessed from names of settings or sizes of rewards."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.batched_envs import BatchedEnvBase
+from torchrl.envs.transforms import StepCounter, TransformedEnv
+
+from hdrqn_torchrl import keys
+
+InOrder = Callable[[TensorDictBase], Tensor]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What an environment says about its task, in an attribute ``task``. What it leaves out is unknown.
+
+    A return is the sum of the rewards from any step of an episode on, discounted or not.
+
+    Args:
+        max_steps: longest episode in steps; ``None``: unknown, or there is no end.
+        largest_return: largest return there can be of ``reward``.
+        largest_extrinsic_return: largest return there can be of ``extrinsic_reward``.
+        smallest_extrinsic_return: smallest one; 0 where that reward is never negative.
+        in_order: for tasks whose subgoals have an order: from what the environment wrote after a step ``[N]``, the
+            share of all subgoals that the step reached in the proper order ``[N]``; ``None``: they have none.
+
+    Raises:
+        ValueError: if a number breaks its rule.
+
+    Examples:
+        >>> Task(max_steps=50, largest_return=2.0).largest_return
+        2.0
+    """
+
+    max_steps: int | None = None
+    largest_return: float = math.inf
+    largest_extrinsic_return: float = math.inf
+    smallest_extrinsic_return: float = -math.inf
+    in_order: InOrder | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_steps is not None and self.max_steps < 1:
+            raise ValueError(f"max_steps must be >= 1 or None, got {self.max_steps}; None: unknown.")
+        if not self.smallest_extrinsic_return <= self.largest_extrinsic_return:
+            raise ValueError(
+                f"smallest_extrinsic_return must be <= largest_extrinsic_return={self.largest_extrinsic_return}, got "
+                f"{self.smallest_extrinsic_return}; leave out what is not known."
+            )
+
+    def within(self, max_steps: int | None) -> Task:
+        """The same task with episodes that are cut off after ``max_steps`` steps, if not before."""
+        limits = [limit for limit in (self.max_steps, max_steps) if limit is not None]
+        return replace(self, max_steps=min(limits, default=None))
+
+
+def task_of(env: EnvBase) -> Task:
+    """What an environment says about its task, found through transforms, wrappers and batches of environments.
+
+    The length of an episode is also read from ``StepCounter`` and from the limits of Gymnasium.
+
+    Args:
+        env: any environment. Of a batch of environments, the first one is built anew and asked.
+
+    Examples:
+        >>> from torchrl.envs import StepCounter, TransformedEnv
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> task_of(TransformedEnv(MultiGoalGridEnv(4, max_steps=50), StepCounter(max_steps=20))).max_steps
+        20
+    """
+    if isinstance(env, TransformedEnv):
+        limits = [each.max_steps for each in env.transform.modules() if isinstance(each, StepCounter)]
+        task = task_of(env.base_env)
+        for limit in limits:
+            task = task.within(limit)
+        return task
+    if isinstance(env, BatchedEnvBase):
+        return _task_of_worker(env)
+    wrapped = getattr(env, "_env", None)  # of GymWrapper
+    for source in (env, getattr(wrapped, "unwrapped", None)):
+        if isinstance(stated := getattr(source, "task", None), Task):
+            return stated.within(_gymnasium_limit(wrapped))
+    return Task(max_steps=_gymnasium_limit(wrapped))
+
+
+def _task_of_worker(env: BatchedEnvBase) -> Task:
+    """Asked of a new one: a worker process that lacks an attribute ends when it is asked for it."""
+    with torch.random.fork_rng(devices=[]):  # to look changes nothing
+        worker = env.create_env_fn[0](**env.create_env_kwargs[0])
+    try:
+        return task_of(worker)
+    finally:
+        worker.close()
+
+
+def _gymnasium_limit(wrapped: object) -> int | None:
+    """The shortest time limit among an environment's wrappers, or the one it is registered with."""
+    limits = [getattr(getattr(wrapped, "spec", None), "max_episode_steps", None)]
+    while wrapped is not None:
+        limits.append(getattr(wrapped, "_max_episode_steps", None))  # of gymnasium.wrappers.TimeLimit
+        wrapped = getattr(wrapped, "env", None)
+    return min((limit for limit in limits if isinstance(limit, int) and limit > 0), default=None)
+
+
+def goals_in_order(num_goals: int) -> InOrder:
+    """How ``in_order`` is counted where the extrinsic reward is 1 for each of so many goals in order, else less."""
+    return partial(_full_reward_share, num_goals)
+
+
+def _full_reward_share(num_goals: int, after: TensorDictBase) -> Tensor:
+    return (after.get(keys.EXTRINSIC_REWARD).squeeze(-1) >= 1.0).float() / num_goals

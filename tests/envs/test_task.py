@@ -1,0 +1,89 @@
+"""What tasks tell about themselves."""
+
+import pickle
+from functools import partial
+
+import gymnasium
+import pytest
+import torch
+from helpers import small_env
+from tensordict import TensorDict
+from torchrl.envs import GymWrapper, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+
+from hdrqn_torchrl.envs import MultiGoalGridEnv, Task, task_of
+
+
+def cart_pole(max_steps: int | None = 37) -> GymWrapper:
+    return GymWrapper(gymnasium.make("CartPole-v1", max_episode_steps=max_steps), categorical_action_encoding=True)
+
+
+class Counting(gymnasium.Env):
+    """A stock environment that has a ``task`` of its own, which is none of ours."""
+
+    observation_space, action_space = gymnasium.spaces.Discrete(3), gymnasium.spaces.Discrete(2)
+    task = "count"
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, False, False, {}
+
+
+class Stating(Counting):
+    task = Task(largest_return=7.0)
+
+
+class TestWhatIsFound:
+    def test_the_grid_states_its_length_its_returns_and_its_order(self):
+        task = task_of(small_env(2, num_goals=3, max_steps=9))
+        assert (task.max_steps, task.largest_return) == (9, 3.0)
+        assert (task.smallest_extrinsic_return, task.largest_extrinsic_return) == (0.0, 3.0)
+        after = TensorDict({"extrinsic_reward": torch.tensor([[1.0], [0.01], [0.0]])}, [3])
+        torch.testing.assert_close(task.in_order(after), torch.tensor([1 / 3, 0.0, 0.0]))
+
+    def test_a_task_that_says_nothing_is_unknown_in_everything(self):
+        assert task_of(GymWrapper(Counting(), categorical_action_encoding=True)) == Task()
+
+    @pytest.mark.parametrize("limit, expected", [(5, 5), (50, 9)])
+    def test_a_step_counter_shortens_episodes_and_never_lengthens_them(self, limit, expected):
+        env = TransformedEnv(TransformedEnv(small_env(2, max_steps=9)), StepCounter(max_steps=limit))
+        assert task_of(env).max_steps == expected
+
+    def test_a_step_counter_without_a_limit_says_nothing(self):
+        assert task_of(TransformedEnv(cart_pole(None), StepCounter())).max_steps == 500  # CartPole's own
+
+    def test_gymnasium_s_time_limit_is_known(self):
+        assert task_of(cart_pole(37)) == Task(max_steps=37)
+
+    def test_a_gymnasium_environment_can_state_a_task(self):
+        env = GymWrapper(gymnasium.wrappers.TimeLimit(Stating(), 11), categorical_action_encoding=True)
+        assert task_of(env) == Task(largest_return=7.0, max_steps=11)
+
+    @pytest.mark.parametrize("batch", [SerialEnv, ParallelEnv])
+    def test_batches_of_environments_state_the_task_of_the_first(self, batch):
+        env = batch(2, partial(MultiGoalGridEnv, 1, num_goals=3))
+        generator = torch.get_rng_state()
+        task = task_of(env)
+        assert (task.max_steps, task.largest_return) == (50, 3.0)
+        assert torch.equal(torch.get_rng_state(), generator)
+
+    def test_it_travels_to_other_processes(self):
+        task = task_of(small_env(2))
+        after = TensorDict({"extrinsic_reward": torch.ones(2, 1)}, [2])
+        assert torch.equal(pickle.loads(pickle.dumps(task)).in_order(after), task.in_order(after))
+
+
+@pytest.mark.parametrize(
+    "settings, message",
+    [
+        ({"max_steps": 0}, "max_steps must be >= 1 or None, got 0"),
+        (
+            {"largest_extrinsic_return": -1.0, "smallest_extrinsic_return": 0.0},
+            "smallest_extrinsic_return must be <= largest_extrinsic_return=-1.0, got 0.0",
+        ),
+    ],
+)
+def test_contradictions_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Task(**settings)
