@@ -166,7 +166,7 @@ def _flat(node: Any, path: str = "") -> dict[str, Any]:
 
 def record(run: Plan) -> None:
     """Writes ``config.yaml`` and, at the beginning, ``run.json`` (where the run comes from)."""
-    from hdrqn_torchrl.run_folder import write_whole
+    from hdrqn_torchrl.run_files import write_whole
 
     if not (run.folder / "run.json").exists():
         origin = {

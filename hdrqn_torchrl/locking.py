@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hdrqn_torchrl.run_files import RunFileError, open_descriptor, open_file
+
 try:
     import fcntl
 except ImportError:  # Windows
@@ -19,7 +21,6 @@ except ImportError:  # Windows
 
 Owner = dict[str, str | int | float | None]
 _NO_FLOCK = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL}
-_NO_FOLLOW = getattr(os, "O_NOFOLLOW", 0)  # a link could lead to any file
 _LARGEST = 4_096  # bytes of a file that names an owner
 
 
@@ -50,6 +51,7 @@ def lock(path: Path, *, patience_seconds: float = 0.0, tell: Callable[[str], Non
 
     Raises:
         InUse: if another process holds it all that time.
+        RunFileError: if ``path`` is something else.
         OSError: if the file can't be written.
     """
     until = time.monotonic() + patience_seconds
@@ -72,7 +74,7 @@ def lock(path: Path, *, patience_seconds: float = 0.0, tell: Callable[[str], Non
 
 def _take(path: Path) -> Callable[[], None]:
     """Takes the lock or raises :class:`InUse`; returns what gives it back."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | _NO_FOLLOW, 0o644)
+    descriptor = open_descriptor(path, os.O_RDWR | os.O_CREAT)  # a link could lead to any file
     try:
         if _flock(descriptor):
             os.ftruncate(descriptor, 0)
@@ -138,9 +140,9 @@ def _take_over(path: Path, dead: Owner) -> None:
 def _read(path: Path) -> Owner | None:
     """What a file of :func:`_create` says; ``None`` if it is just being written, or something else."""
     try:
-        with os.fdopen(os.open(path, os.O_RDONLY | _NO_FOLLOW | getattr(os, "O_NONBLOCK", 0)), "rb") as file:
+        with open_file(path) as file:
             return _parse(file.read(_LARGEST)) or None
-    except OSError:
+    except (OSError, RunFileError):
         return None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ from hdrqn_torchrl.envs.ceilings import ceiling
 from hdrqn_torchrl.envs.scripted import PLAYERS
 from hdrqn_torchrl.locking import InUse, lock
 from hdrqn_torchrl.plotting import plot_run, read_metrics
+from hdrqn_torchrl.run_files import replaced, write_whole
 from hdrqn_torchrl.trainer import Trainer
 
 References = dict[str, dict[str, float]]
@@ -44,18 +44,9 @@ def write_results(
         "ceiling": ceiling_of(references),
     }
     write_whole(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
-    plot_run(read_metrics(folder / "metrics.csv"), folder / "curves.png", title=title, references=references)
+    with replaced(folder / "curves.png") as picture:
+        plot_run(read_metrics(folder / "metrics.csv"), picture, title=title, references=references)
     return summary
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Writes a text file that is either whole or the one before, whatever happens."""
-    partial = path.with_name(f"{path.name}.partial")
-    with partial.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from processes import start
 
-from hdrqn_torchrl.run_folder import ceiling_of, locked, write_results, write_whole
+from hdrqn_torchrl.run_folder import ceiling_of, locked, write_results
 
 REFERENCES = {"planner": {"return_mean": 2.0}, "memory": {"return_mean": 1.9, "steps_mean": 16.5}}
 RESULT = {"return_mean": 0.5, "success_rate": 0.25, "in_order_rate": 0.4, "steps_mean": 40.0, "episodes": 100}
@@ -38,21 +38,6 @@ def test_a_task_without_scripted_players_has_no_ceiling(folder):
 def test_the_ceiling_is_that_of_the_player_with_the_agents_view():
     assert ceiling_of(REFERENCES) == 1.9
     assert ceiling_of({"planner": {"return_mean": 2.0}}) is None
-
-
-class TestWriteWhole:
-    def test_it_replaces_a_file_and_leaves_nothing_else(self, tmp_path):
-        for text in ("first and long", "second"):
-            write_whole(tmp_path / "run.json", text)
-            assert (tmp_path / "run.json").read_text() == text
-        assert len(list(tmp_path.iterdir())) == 1
-
-    def test_a_failed_write_keeps_the_file_before(self, tmp_path, monkeypatch):
-        write_whole(tmp_path / "run.json", "before")
-        monkeypatch.setattr(os, "fsync", lambda _: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            write_whole(tmp_path / "run.json", "after")
-        assert (tmp_path / "run.json").read_text() == "before"
 
 
 def hold(folder):
@@ -89,6 +74,18 @@ class TestLocked:
             locked(tmp_path),
         ):
             raise AssertionError("both are in")
+
+    @pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
+    def test_what_is_no_lock_is_refused_and_a_link_is_not_followed(self, tmp_path, kind):
+        (tmp_path / "mine").write_text("mine")
+        (tmp_path / "run").mkdir()
+        place = tmp_path / "run" / ".lock"
+        {"link": lambda: place.symlink_to(tmp_path / "mine"), "pipe": lambda: os.mkfifo(place), "folder": place.mkdir}[
+            kind
+        ]()
+        with pytest.raises(ValueError, match=r"\.lock must be what a run leaves there, got "), locked(tmp_path / "run"):
+            raise AssertionError("it is in")
+        assert (tmp_path / "mine").read_text() == "mine"
 
     def test_a_folder_that_can_not_be_written(self, tmp_path):
         (tmp_path / "file").write_text("")
