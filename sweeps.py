@@ -14,6 +14,8 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
+import time
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
@@ -23,6 +25,9 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+POLL_SECONDS = 1.0
+PATIENCE_SECONDS = 120.0
+"""How long a job of a sweep waits for a process in its folder: one of a killed sweep has yet to save itself."""
 STARTED, DONE = "started", "done"
 Note = dict[str, Any]
 
@@ -39,9 +44,10 @@ class Sweep(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """In the main process, before all jobs."""
-        self.ledger = Path(config.hydra.sweep.dir) / "jobs.jsonl"
+        ledger = Path(config.hydra.sweep.dir) / "jobs.jsonl"
+        self.ledger = ledger.absolute()  # jobs may have other working directories
         self.ledger.unlink(missing_ok=True)
-        atexit.register(report, self.ledger)  # Hydra leaves out on_multirun_end when a sweep ends with an exception
+        atexit.register(report, ledger)  # Hydra leaves out on_multirun_end when a sweep ends with an exception
         if not config.hydra.launcher._target_.endswith(".BasicLauncher"):
             for number in SIGNALS:
                 signal.signal(number, _stop.pass_on)
@@ -58,7 +64,7 @@ class Sweep(Callback):
         """In the process of the job; left out if it was killed, or stopped in the main process."""
         if self.ledger is None:
             return
-        _stop.in_job = False
+        _stop.in_job = False  # before the note: an orphan has none to make
         try:
             with contextlib.redirect_stderr(io.StringIO()):  # a failed job's result prints its overrides and raises
                 _ = job_return.return_value
@@ -81,9 +87,11 @@ class Sweep(Callback):
 
     def _note(self, config: DictConfig, state: str) -> None:
         assert self.ledger is not None
+        if _stop.orphaned:
+            return  # the same command may have been given again: the book is that sweep's now
         note = {
             "job": config.hydra.job.num,
-            "folder": os.path.relpath(config.hydra.runtime.output_dir),
+            "folder": os.path.relpath(config.hydra.runtime.output_dir, config.hydra.runtime.cwd),
             "overrides": list(config.hydra.overrides.task),
             "state": state,
         }
@@ -135,6 +143,8 @@ class _Stop:
     def __init__(self) -> None:
         self.number: int | None = None
         self.in_job = False
+        self.orphaned = False
+        self._watching = False
 
     def pass_on(self, number: int, _: FrameType | None) -> None:
         """In the main process, which goes on waiting for its workers; a second signal ends all of them at once."""
@@ -151,6 +161,19 @@ class _Stop:
         for number in SIGNALS:
             signal.signal(number, self._leave_job)
         self.in_job = self.number is None
+        if not self._watching:
+            self._watching = True
+            threading.Thread(target=self._watch_parent, args=(os.getppid(),), daemon=True).start()
+
+    def _watch_parent(self, parent: int) -> None:
+        """Ends this worker when the sweep's main process is no more (kill -9), after its job has saved itself."""
+        while os.getppid() == parent:
+            time.sleep(POLL_SECONDS)
+        self.orphaned = True
+        os.kill(os.getpid(), signal.SIGTERM)
+        while self.in_job:
+            time.sleep(0.1)
+        os._exit(128 + signal.SIGTERM)
 
     def _leave_job(self, number: int, _: FrameType | None) -> None:
         """An idle worker only remembers: if one dies, joblib kills all others."""

@@ -35,6 +35,7 @@ def main(config: DictConfig) -> float:
     Exit codes: 0 done; 1 failed, and a message says why; 130 and 143 stopped by SIGINT or SIGTERM: resume me.
     """
     folder, run = Path(HydraConfig.get().runtime.output_dir), None
+    os.chdir(HydraConfig.get().runtime.cwd)  # where paths were given: hydra.job.chdir=true would move below them
     sweeps.refuse_if_stopped()
     try:
         check(config)
@@ -65,10 +66,14 @@ def train(run: Plan) -> float:
 
     torch.set_num_threads(run.config.threads)
     try:
-        with locked(run.folder), noting_errors(run):
-            trainer, evaluation_env, references = begin(run)
-            trainer.train()
-            return write_summary(run, trainer, evaluation_env, references)["return_mean"]
+        patience = sweeps.PATIENCE_SECONDS if HydraConfig.get().mode == RunMode.MULTIRUN else 0.0
+        with locked(run.folder, patience_seconds=patience, tell=tell):
+            refused = (InstantiationException, ValueError, CheckpointError) if run.resumed else ()
+            with noting_errors(run, unless=refused):
+                trainer, evaluation_env, references = begin(run)
+            with noting_errors(run):
+                trainer.train()
+                return write_summary(run, trainer, evaluation_env, references)["return_mean"]
     except (InstantiationException, ValueError) as error:
         raise SettingsError(explain(error)) from error
     except (CheckpointError, NonFiniteError) as error:
@@ -78,13 +83,18 @@ def train(run: Plan) -> float:
         raise RunError(f"{error}; {remedy}.") from error
 
 
+def tell(sentence: str) -> None:
+    """Says on the terminal what takes long."""
+    print(sentence, file=sys.stderr, flush=True)
+
+
 @contextlib.contextmanager
-def noting_errors(run: Plan) -> Iterator[None]:
+def noting_errors(run: Plan, *, unless: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """A training that fails leaves a traceback; one that can't be resumed with new settings has not failed."""
     try:
         yield
     except Exception as error:
-        if not (run.resumed and isinstance(error, (InstantiationException, ValueError))):
+        if not isinstance(error, unless):
             note_error(run.folder)
         raise
 

@@ -1,6 +1,7 @@
 import json
 import os
 import signal
+import socket
 import time
 from types import SimpleNamespace
 
@@ -63,6 +64,17 @@ class TestLocked:
         process.join(30)
         with locked(tmp_path / "run"):
             pass
+
+    def test_who_waits_is_told_for_whom(self, tmp_path):
+        told = []
+        with (
+            locked(tmp_path),
+            pytest.raises(ValueError, match="is in use"),
+            locked(tmp_path, patience_seconds=0.3, tell=told.append),
+        ):
+            raise AssertionError("both are in")
+        who = f"process {os.getpid()} on {socket.gethostname()}"
+        assert told == [f"{tmp_path} is in use: waiting for {who}, which is training there"]
 
     def test_one_after_the_other_in_a_process(self, tmp_path):
         for _ in range(2):

@@ -134,6 +134,21 @@ def test_a_stopped_parallel_sweep_saves_its_jobs(tmp_path, number, code, whole_g
 
 
 @pytest.mark.slow
+def test_a_killed_parallel_sweep_leaves_saved_jobs_and_the_same_command_goes_on(tmp_path):
+    command = [sys.executable, str(ROOT / "train.py"), *COMMON, "sweep=parallel", "hydra.launcher.n_jobs=2", "seed=0,1"]
+    command += ["resume=auto", "total_frames=12000", "evaluation.interval_frames=6000"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL, text=True)
+    wait_until(lambda: len(list(tmp_path.glob("sweep/*/metrics.csv"))) == 2)
+    process.kill()
+    process.wait()
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    assert finished(tmp_path) == ["0", "1"]
+    for job in (0, 1):
+        assert json.loads(next(tmp_path.glob(f"sweep/{job}-*/summary.json")).read_text())["frames"] == 12_000 + 32
+
+
+@pytest.mark.slow
 def test_a_stopped_serial_sweep_ends(tmp_path):
     command = [sys.executable, str(ROOT / "train.py"), "-m", *COMMON, "seed=0,1", "total_frames=100000000"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
@@ -176,7 +191,7 @@ class TestConfiguration:
 def job_config(folder, *, number=0, sweeper="hydra._internal.core_plugins.basic_sweeper.BasicSweeper", overrides=()):
     hydra = {
         "job": {"num": number},
-        "runtime": {"output_dir": str(folder / f"job{number}")},
+        "runtime": {"output_dir": str(folder / f"job{number}"), "cwd": str(folder)},
         "overrides": {"task": list(overrides)},
         "sweeper": {"_target_": sweeper},
         "sweep": {"dir": str(folder)},
@@ -291,6 +306,32 @@ class TestStop:
             sweeps.end_stopped_job(143)
         with pytest.raises(sweeps.JobStopped, match="not started"):
             sweeps.refuse_if_stopped()
+
+    @pytest.mark.parametrize("saving_polls", [0, 3])
+    def test_a_worker_whose_sweep_was_killed_ends_when_its_job_has_saved_itself(self, monkeypatch, saving_polls):
+        stop, parents, told = sweeps._stop, iter([7, 7, 1]), []
+        stop.in_job = saving_polls > 0
+
+        def sleep(_):
+            told.append("sleep")
+            if told.count("sleep") == 2 + saving_polls:
+                stop.in_job = False
+
+        monkeypatch.setattr(sweeps.time, "sleep", sleep)
+        monkeypatch.setattr(sweeps.os, "getppid", lambda: next(parents))
+        monkeypatch.setattr(sweeps.os, "kill", lambda _, number: told.append(number))
+        monkeypatch.setattr(sweeps.os, "_exit", told.append)
+        stop._watch_parent(7)
+        assert told == ["sleep", "sleep", signal.SIGTERM, *["sleep"] * saving_polls, 143]
+        assert stop.orphaned
+
+    def test_an_orphan_leaves_the_book_to_the_sweep_that_was_begun_since(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(sweeps.atexit, "register", lambda *_: None)
+        callback = sweeps.Sweep()
+        callback.on_multirun_start(job_config(tmp_path))
+        sweeps._stop.orphaned = True
+        callback.on_job_end(job_config(tmp_path), job_return(RuntimeError("stopped")))
+        assert sweeps.read_ledger(callback.ledger) == []
 
     def test_in_the_main_process_it_ends_the_program(self):
         with pytest.raises(SystemExit) as stop:
