@@ -1,5 +1,6 @@
 """A training that was stopped and resumed is, bit for bit, the one that was not."""
 
+import random
 import shutil
 import signal
 from collections.abc import Callable
@@ -23,6 +24,7 @@ TRAININGS = {
         learner={"learning_rate_end": 1e-3, "learning_rate_frames": 200, "slice_len": 2, "loss_function": "smooth_l1"},
     ),
     "v2": partial(make_training, name="v2"),
+    "v2-odd": partial(make_training, name="v2", learner={"capacity": 43}),  # no multiple of the four environments
     "v2-refreshed": partial(make_training, name="v2", options={"refresh_hidden_steps": 7}),
     "v2-hindsight": partial(
         make_training,
@@ -121,7 +123,7 @@ def options_in_progress(trainer):
 def memories_wrapped(trainer):
     """Every replay memory is full and was written over from its beginning on."""
     for learner in trainer.algorithm.learners.values():
-        assert len(learner.buffer) == 40
+        assert learner.buffer.is_full()
         assert 0 < learner.buffer.state_dict()["_writer"]["_cursor"] < len(learner.buffer.storage[:])
 
 
@@ -149,7 +151,7 @@ def memory_for_disk():
 
 FEW = ("between two updates", "in the middle of options", "with full memories")
 PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
-PAIRS += [(training, cut) for training in ("v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
+PAIRS += [(training, cut) for training in ("v2-odd", "v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
 PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of metrics", *FEW[1:])]
 PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole"))]
 PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
@@ -222,6 +224,40 @@ def test_one_that_is_stopped_again_and_again(training, tmp_path):
         with pytest.raises(Interrupted):
             trainer.train()
     resume(build, tmp_path).train()
+    check_same(tmp_path, folder / "uninterrupted")
+
+
+def stop_after(trainer, moments):
+    """A stop request once the trainer has looked for one so many times: before updates and after iterations."""
+    check = trainer._stop.check
+
+    def counting():
+        nonlocal moments
+        moments -= 1
+        if moments == 0:
+            signal.raise_signal(signal.SIGTERM)
+        check()
+
+    trainer._stop.check = counting
+
+
+@pytest.mark.parametrize("training", ["v2-odd", "v3-r2d2"], indirect=True)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_one_that_is_cut_at_random_moments(training, seed, tmp_path):
+    build, folder = training
+    generator, cuts, wrapped = random.Random(seed), 0, 0
+    shutil.copytree(folder / "in the first evaluation", tmp_path, dirs_exist_ok=True)
+    while True:
+        trainer = resume(build, tmp_path)
+        wrapped += all(learner.buffer.is_full() for learner in trainer.algorithm.learners.values())
+        stop_after(trainer, generator.randint(1, 12))
+        try:
+            trainer.train()
+        except Interrupted:
+            cuts += 1
+        else:
+            break
+    assert cuts >= 3 and wrapped >= 2
     check_same(tmp_path, folder / "uninterrupted")
 
 

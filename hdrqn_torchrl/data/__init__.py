@@ -4,17 +4,19 @@ from hdrqn_torchrl.data.hindsight import HindsightOptions, relabel_subgoals
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
 from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
-from hdrqn_torchrl.data.replay import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
-from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
+from hdrqn_torchrl.data.replay import FROM_STARTS, Sampling, SequenceBuffer, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data.samplers import EpisodeSliceSampler, EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
 
 __all__ = [
     "FROM_STARTS",
+    "EpisodeSliceSampler",
     "EpisodeStartSampler",
     "HindsightOptions",
     "OptionExtractor",
     "OptionHistory",
     "PrioritizedSequenceSampler",
     "Sampling",
+    "SequenceBuffer",
     "StepSelector",
     "StepSliceSampler",
     "WholeEpisodeSampler",

@@ -93,6 +93,11 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         index, info = padded_slices(start, left.flatten()[place], self.slice_len, rows=storage.shape[0])
         return index, {**info, "priority_weight": weight.repeat_interleave(self.slice_len)}
 
+    def can_sample(self, storage: Storage) -> bool:
+        """Whether a complete sequence begins in a storage that is not empty."""
+        self._admit(storage)
+        return bool(self._starts.any())
+
     def _admit(self, storage: Storage) -> Tensor:
         """Takes up the starts that have become complete since the last draw; returns the steps left from each step."""
         if self._left is None or self._revision != storage._mutation_revision:
@@ -159,7 +164,12 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it is of another capacity, or holds what is no priority.
+        """
+        self._check_state(state_dict["priorities"], state_dict["starts"], state_dict["largest"])
         self._empty()
         self._starts = state_dict["starts"].clone()
         known = self._starts.nonzero().squeeze(-1)
@@ -167,3 +177,14 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
             self._sum_tree[known] = self._min_tree[known] = state_dict["priorities"][known]
         if state_dict["largest"] is not None:
             self._max_priority = (torch.tensor(state_dict["largest"]), None)
+
+    def _check_state(self, priorities: Tensor, starts: Tensor, largest: float | None) -> None:
+        shape = (self._max_capacity,)
+        if priorities.shape != shape or starts.shape != shape or starts.dtype != torch.bool:
+            raise ValueError(
+                f"stored priorities must be those of {self._max_capacity} steps, got {list(priorities.shape)} and "
+                f"{list(starts.shape)}; load them with the capacity and num_envs that they were saved with."
+            )
+        known = priorities[starts]
+        if not (torch.isfinite(known) & (known > 0)).all() or not (largest is None or 0 <= largest < float("inf")):
+            raise ValueError("stored priorities must be finite and > 0, got others; use another checkpoint.")

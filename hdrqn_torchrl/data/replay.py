@@ -6,41 +6,62 @@ from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
-from torchrl.data.replay_buffers import Sampler
+from torch import Tensor
+from torchrl.data import TensorDictReplayBuffer
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
-from hdrqn_torchrl.data.samplers import EpisodeStartSampler, StepSliceSampler, WholeEpisodeSampler
+from hdrqn_torchrl.data.samplers import (
+    EpisodeSliceSampler,
+    EpisodeStartSampler,
+    StepSliceSampler,
+    WholeEpisodeSampler,
+)
+from hdrqn_torchrl.data.storage import SequenceStorage
 
 Sampling = Literal["steps", "episodes", "episode_starts", "whole_episodes"]
 FROM_STARTS = ("episode_starts", "whole_episodes")
 """Samplings whose sequences all begin where an episode does, so that the zero state is exact."""
+AnySampler = StepSliceSampler | EpisodeStartSampler | PrioritizedSequenceSampler
 
 
-class SequenceStorage(LazyTensorStorage):
-    """TorchRL's storage, whose state includes where it was written last.
+class SequenceBuffer(TensorDictReplayBuffer):
+    """TorchRL's replay buffer for batches of any length: a single step, or more than it can hold."""
 
-    Without that, the first samples after a restart join the newest step in the ring to the oldest.
-    """
+    def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
+        """Stores transitions ``[N, T]`` or ``[M]``; of too many, the newest.
 
-    def state_dict(self) -> dict[str, Any]:
-        if self._storage is None:
-            return {"stored": None}
-        stored = self[:]  # the part that was written
-        return {"stored": stored, "rows": len(self._storage), "last_cursor": self._last_cursor_index}
+        Args:
+            tensordicts: what is stored.
+            update_priority: not read; new sequences have the largest priority.
+
+        Raises:
+            ValueError: if they are not of the shape that the memory was built for.
+        """
+        self._storage.check_shape(tensordicts)
+        return self._extend(tensordicts[..., -self._storage.rows :])
+
+    def can_sample(self) -> bool:
+        """Whether a sequence can be drawn by now."""
+        return len(self) > 0 and self._sampler.can_sample(self._storage)
+
+    def is_full(self) -> bool:
+        """Whether what comes next is written over what was stored first."""
+        return self._storage._is_full
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        stored = state_dict["stored"]
-        self._bump_mutation_revision()  # what samplers remember of the old contents is void
-        self.initialized = stored is not None
-        if stored is None:
-            self._storage, self._len = None, 0
-            return
-        self._storage = stored[:1].expand(state_dict["rows"], *stored.shape[1:]).clone()
-        self._storage[: len(stored)] = stored
-        self._len = stored.numel()
-        self._set_last_cursor(state_dict["last_cursor"])
+        """Restores what ``state_dict`` returned.
+
+        Raises:
+            ValueError: if it is of a memory of another size, or can't be what a memory returned.
+        """
+        cursor = state_dict["_writer"]["_cursor"]
+        if not 0 <= cursor < self._storage.rows:
+            raise ValueError(
+                f"the stored memory's next row must lie in [0, {self._storage.rows}), got {cursor}; it is damaged: use "
+                "another checkpoint."
+            )
+        super().load_state_dict(state_dict)
 
 
 def make_sequence_buffer(
@@ -49,25 +70,31 @@ def make_sequence_buffer(
     slice_len: int,
     batch_size: int,
     num_envs: int | None = None,
+    lookahead: int = 0,
+    episode_len: int | None = None,
     sampling: Sampling = "steps",
     priority_exponent: float | None = None,
     importance_exponent: float = 0.6,
     traj_key: NestedKey = keys.TRAJ_IDS,
     device: torch.device | str = "cpu",
-) -> TensorDictReplayBuffer:
+) -> SequenceBuffer:
     """A TorchRL replay buffer from which random slices of episodes are drawn ("bootstrapped random updates").
 
     Trajectories shorter than ``slice_len`` are not dropped: they are padded and ``("collector", "mask")`` tells
     which steps are real.
 
     Args:
-        capacity: number of transitions kept.
+        capacity: number of transitions kept, rounded up to the same number for each environment.
         slice_len: n, transitions of a sequence.
         batch_size: number of sequences of a sample.
-        num_envs: N if the buffer is extended by collected batches ``[N, T]`` with T >= 2 (steps); ``None`` if by rows
-            ``[M]`` that keep each episode together (options).
+        num_envs: N if the buffer is extended by collected batches ``[N, T]`` (steps); ``None`` if by rows ``[M]`` that
+            keep each episode together (options).
+        lookahead: transitions that a sequence has beyond ``slice_len``. Where it begins does not depend on them.
+        episode_len: largest number of transitions of an episode, if known; then a capacity is refused with which
+            sequences from the start of an episode might run out.
         sampling: ``"steps"``: every step is equally likely to start a slice (:class:`StepSliceSampler`);
-            ``"episodes"``: a random episode, then a random start in it, as the paper describes it;
+            ``"episodes"``: a random episode, then a random start in it, as the paper describes it
+            (:class:`EpisodeSliceSampler`);
             ``"episode_starts"``: from the start of a random episode on, and into the next ones
             (:class:`EpisodeStartSampler`); ``"whole_episodes"``: the same, padded after the episode's end
             (:class:`WholeEpisodeSampler`).
@@ -88,56 +115,79 @@ def make_sequence_buffer(
     """
     if slice_len < 1:
         raise ValueError(f"slice_len must be >= 1, got {slice_len}; use 1 for a feed-forward network.")
+    if lookahead < 0:
+        raise ValueError(f"lookahead must be >= 0 transitions, got {lookahead}; use 0.")
     if batch_size < 1:
         raise ValueError(f"batch_size must be >= 1 sequence, got {batch_size}; use 32.")
-    if capacity < slice_len * max(num_envs or 1, 1):
-        raise ValueError(
-            f"capacity must hold at least slice_len={slice_len} transitions of each of {num_envs or 1} environments, "
-            f"got {capacity}; the paper keeps 100,000 steps and 50,000 options."
-        )
     if sampling == "episode_starts" and num_envs is None:
         raise ValueError("sampling must be 'steps', 'episodes' or 'whole_episodes' for rows, got 'episode_starts'.")
-    sampler: Sampler = _make_sampler(sampling, slice_len, traj_key)
-    if priority_exponent is not None:
-        if sampling == "episodes":
-            raise ValueError(
-                "sampling must be 'steps', 'episode_starts' or 'whole_episodes' with priority_exponent, got "
-                "'episodes', which picks an episode first."
-            )
+    length = slice_len + lookahead
+    _check_capacity(capacity, slice_len, lookahead, num_envs or 1, sampling, episode_len)
+    storage = SequenceStorage(capacity, num_envs=num_envs, device=device)
+    sampler: AnySampler
+    if priority_exponent is None:
+        sampler = _make_sampler(sampling, slice_len, lookahead, traj_key)
+    elif sampling == "episodes":
+        raise ValueError(
+            "sampling must be 'steps', 'episode_starts' or 'whole_episodes' with priority_exponent, got 'episodes', "
+            "which picks an episode first."
+        )
+    else:
         sampler = PrioritizedSequenceSampler(
-            -(-capacity // (num_envs or 1)) * (num_envs or 1),  # as many as the storage will hold
-            slice_len=slice_len,
+            storage.max_size,
+            slice_len=length,
             sampling=sampling,
             priority_exponent=priority_exponent,
             importance_exponent=importance_exponent,
             traj_key=traj_key,
         )
-    return TensorDictReplayBuffer(
-        storage=SequenceStorage(capacity, ndim=1 if num_envs is None else 2, device=device),
-        sampler=sampler,
-        batch_size=batch_size * slice_len,
-    )
+    return SequenceBuffer(storage=storage, sampler=sampler, batch_size=batch_size * length)
 
 
-def _make_sampler(sampling: Sampling, slice_len: int, traj_key: NestedKey) -> SliceSampler:
-    own = {"steps": StepSliceSampler, "episode_starts": EpisodeStartSampler, "whole_episodes": WholeEpisodeSampler}
-    if sampling in own:
-        return own[sampling](slice_len=slice_len, traj_key=traj_key)
-    if sampling != "episodes":
+def _check_capacity(
+    capacity: int, slice_len: int, lookahead: int, num_envs: int, sampling: Sampling, episode_len: int | None
+) -> None:
+    """Refuses a memory that can't hold a sequence, or in which there may be none at times."""
+    beyond = f" and {lookahead} beyond" if lookahead else ""
+    rows, needed = -(-capacity // num_envs), slice_len + lookahead
+    if rows < needed or capacity < num_envs * slice_len:
         raise ValueError(
-            f"sampling must be 'steps', 'episodes', 'episode_starts' or 'whole_episodes', got {sampling!r}; the paper "
-            "has 'episodes'."
+            f"capacity must hold at least slice_len={slice_len} transitions{beyond} of each of {num_envs} "
+            f"environments, got {capacity}; the paper keeps 100,000 steps and 50,000 options."
         )
-    return SliceSampler(
-        slice_len=slice_len,
-        traj_key=traj_key,
-        init_key=None,  # keep the stored flag: it tells true starts of episodes
-        cache_values=True,
-        strict_length=False,
-        pad_output=True,
+    if sampling not in FROM_STARTS or episode_len is None:
+        return
+    if sampling == "whole_episodes":
+        needed = min(needed, episode_len)
+    if rows < needed + episode_len - 1:
+        raise ValueError(
+            f"capacity must hold an episode of {episode_len} and slice_len={slice_len} transitions{beyond} of each of "
+            f"{num_envs} environments with sampling={sampling!r}, or no stored sequence may begin where an episode "
+            f"does, got {capacity}; use at least {num_envs * (needed + episode_len - 1)}."
+        )
+
+
+def _make_sampler(sampling: Sampling, slice_len: int, lookahead: int, traj_key: NestedKey) -> AnySampler:
+    length = slice_len + lookahead
+    if sampling == "steps":
+        return StepSliceSampler(slice_len=length, traj_key=traj_key)
+    if sampling == "episodes":
+        return EpisodeSliceSampler(slice_len=length, lookahead=lookahead, traj_key=traj_key)
+    if sampling == "episode_starts":
+        return EpisodeStartSampler(slice_len=length, traj_key=traj_key)
+    if sampling == "whole_episodes":
+        return WholeEpisodeSampler(slice_len=length, traj_key=traj_key)
+    raise ValueError(
+        f"sampling must be 'steps', 'episodes', 'episode_starts' or 'whole_episodes', got {sampling!r}; the paper "
+        "has 'episodes'."
     )
 
 
 def sample_sequences(buffer: TensorDictReplayBuffer, slice_len: int) -> TensorDictBase:
-    """Draws a sample from a buffer of :func:`make_sequence_buffer` as sequences ``[batch_size, slice_len]``."""
+    """Draws a sample from a buffer of :func:`make_sequence_buffer` as sequences ``[batch_size, slice_len]``.
+
+    Args:
+        buffer: where to draw.
+        slice_len: transitions of its sequences, its lookahead included.
+    """
     return buffer.sample().reshape(-1, slice_len)

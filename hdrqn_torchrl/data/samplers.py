@@ -57,6 +57,38 @@ class StepSliceSampler(SliceSampler):
         start[:, 0] += lengths[episode] - left
         return padded_slices(start, left, length, rows=storage.shape[0])
 
+    def can_sample(self, storage: Storage) -> bool:
+        """Whether there is a slice to draw from a storage that is not empty."""
+        return True
+
+
+class EpisodeSliceSampler(StepSliceSampler):
+    """Slices from a random place of a random *episode*, as the paper has it (and TorchRL's ``SliceSampler``).
+
+    The place is such that the episode, if it is long enough, goes on for the whole slice.
+
+    Args:
+        slice_len: steps of a slice.
+        lookahead: how many of them, at its end, have no say in where it begins; they are padding where the episode is
+            over. So an episode's last steps are shown before these as well.
+        traj_key: entry that numbers the episodes.
+    """
+
+    def __init__(self, *, slice_len: int, lookahead: int = 0, traj_key: NestedKey = keys.TRAJ_IDS) -> None:
+        super().__init__(slice_len=slice_len, traj_key=traj_key)
+        self.lookahead = lookahead
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
+        """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
+        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
+        length, count = self._adjusted_batch_size(batch_size)
+        episode = torch.randint(len(lengths), (count,), device=lengths.device, generator=self._rng)
+        steps, start = lengths[episode], first[episode]
+        places = (steps - (length - self.lookahead)).clamp(min=0) + 1
+        passed = (torch.rand(count, device=lengths.device, generator=self._rng) * places).floor().to(start.dtype)
+        start[:, 0] += passed
+        return padded_slices(start, steps - passed, length, rows=storage.shape[0])
+
 
 class WholeEpisodeSampler(StepSliceSampler):
     """Slices that start where a random episode starts, padded after its end.
@@ -75,16 +107,28 @@ class WholeEpisodeSampler(StepSliceSampler):
     ) -> None:
         super().__init__(slice_len=slice_len, traj_key=traj_key)
         self.first_key = init_key
+        self._starts: tuple[int, Tensor, Tensor] | None = None  # revision of the storage, and what it holds then
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
         length, count = self._adjusted_batch_size(batch_size)
-        whole = storage[:].get(self.first_key)[first.unbind(-1)].flatten().nonzero().squeeze(-1)
-        if not len(whole):  # the ring wrote over the beginning of every episode
+        first, lengths = self._whole(storage)
+        if not len(first):  # the ring wrote over the beginning of every episode
             raise RuntimeError("no stored episode has its first step; raise capacity above the length of an episode.")
-        chosen = whole[torch.randint(len(whole), (count,), device=whole.device, generator=self._rng)]
+        chosen = torch.randint(len(first), (count,), device=first.device, generator=self._rng)
         return padded_slices(first[chosen], lengths[chosen], length, rows=storage.shape[0])
+
+    def can_sample(self, storage: Storage) -> bool:
+        """Whether an episode has its first step in a storage that is not empty."""
+        return len(self._whole(storage)[0]) > 0
+
+    def _whole(self, storage: Storage) -> tuple[Tensor, Tensor]:
+        """Where episodes start ``[E, ndim]`` whose first step is stored, and how many steps follow ``[E]``."""
+        if self._starts is None or self._starts[0] != storage._mutation_revision:
+            first, _, lengths = self._get_stop_and_length(storage)
+            whole = storage[:].get(self.first_key)[first.unbind(-1)].flatten().nonzero().squeeze(-1)
+            self._starts = storage._mutation_revision, first[whole], lengths[whole]
+        return self._starts[1:]
 
 
 class EpisodeStartSampler(SliceSampler):
@@ -114,11 +158,7 @@ class EpisodeStartSampler(SliceSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
         length, count = self._adjusted_batch_size(batch_size)
-        contents = storage._mutation_revision
-        if contents not in self._cache:
-            self._cache.clear()
-            self._cache[contents] = self._find_starts(storage, length)
-        time, environment = self._cache[contents]
+        time, environment = self._starts(storage)
         if not len(time):
             raise RuntimeError(
                 f"no stored start of an episode begins slice_len={length} stored steps; update later, raise capacity "
@@ -127,6 +167,18 @@ class EpisodeStartSampler(SliceSampler):
         chosen = torch.randint(len(time), (count,), device=time.device, generator=self._rng)
         times = time[chosen].unsqueeze(-1) + torch.arange(length, device=time.device)
         return ((times % storage.shape[0]).flatten(), environment[chosen].repeat_interleave(length)), {}
+
+    def can_sample(self, storage: Storage) -> bool:
+        """Whether enough steps follow a start of an episode in a storage that is not empty."""
+        return len(self._starts(storage)[0]) > 0
+
+    def _starts(self, storage: Storage) -> tuple[Tensor, Tensor]:
+        """Time and environment of the starts that can be drawn."""
+        contents = storage._mutation_revision
+        if contents not in self._cache:
+            self._cache.clear()
+            self._cache[contents] = self._find_starts(storage, self.slice_len)
+        return self._cache[contents]
 
     def _find_starts(self, storage: Storage, length: int) -> tuple[Tensor, Tensor]:
         steps = storage[:].select(self.first_key, self.traj_key, self.done_key)

@@ -1,57 +1,14 @@
+from functools import partial
+
 import pytest
 import torch
-from tensordict import TensorDict
+from streams import Stream, check_sequences, one_episode
+from torchrl.data import SliceSampler
 
 from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.data.samplers import episode_starts
 
 PADDED = ["steps", "episodes", "whole_episodes"]
-
-
-class Stream:
-    """Consecutive batches of numbered steps; episodes last 1 to 9 steps and end at other times in each environment."""
-
-    def __init__(self, num_envs):
-        self.num_envs, self.next_episode = num_envs, 0
-        self.generator = torch.Generator().manual_seed(num_envs)
-        self.left, self.step, self.episode = [0] * num_envs, [0] * num_envs, [0] * num_envs
-
-    def take(self, length):
-        rows = [[self._advance(n) for _ in range(length)] for n in range(self.num_envs)]
-        episode, step, last = torch.tensor(rows).unbind(-1)
-        done = last.bool().unsqueeze(-1)
-        td = TensorDict(step=step, is_init=(step == 0).unsqueeze(-1), batch_size=[self.num_envs, length])
-        td["collector", "traj_ids"] = episode
-        td["next"] = TensorDict(
-            done=done, terminated=done, truncated=torch.zeros_like(done), batch_size=[self.num_envs, length]
-        )
-        return td
-
-    def _advance(self, n):
-        if self.left[n] == 0:
-            self.left[n] = int(torch.randint(1, 10, (), generator=self.generator))
-            self.step[n], self.episode[n] = -1, self.next_episode
-            self.next_episode += 1
-        self.left[n] -= 1
-        self.step[n] += 1
-        return self.episode[n], self.step[n], int(self.left[n] == 0)
-
-
-def check_sequences(sequences, slice_len, newest):
-    """Each is one trajectory with consecutive steps, at least one of them real, padded only where it ends."""
-    traj, step = sequences["collector", "traj_ids"], sequences["step"]
-    real = sequences.get(("collector", "mask"), torch.ones_like(step, dtype=torch.bool))
-    assert sequences.shape[1] == slice_len
-    assert real[:, 0].all() and (real[:, 1:] <= real[:, :-1]).all()
-    assert (traj == traj[:, :1]).all()
-    assert (step == step[:, :1] + torch.arange(slice_len))[real].all()
-    last = real.sum(-1, keepdim=True) - 1
-    assert (step == step.gather(1, last))[~real].all()  # padding repeats the last real step
-    ended = sequences["next", "terminated"].squeeze(-1).gather(1, last).squeeze(-1)
-    pairs = torch.stack([traj, step], -1)[torch.arange(len(last)), last.squeeze(-1)].tolist()
-    waits = torch.tensor([tuple(pair) in newest for pair in pairs])  # its episode goes on in the next batch
-    assert (ended | waits)[~real[:, -1]].all()
-    assert ((step == 0) == sequences["is_init"].squeeze(-1)).all()  # the flag of true starts is kept
 
 
 class TestSequencesOfSteps:
@@ -109,14 +66,6 @@ def test_sequences_of_options_from_rows_of_whole_episodes(sampling):
     assert len(buffer) == 40
 
 
-def one_episode(number, length):
-    td = TensorDict(step=torch.arange(length), batch_size=[length])
-    td["collector", "traj_ids"] = torch.full((length,), number)
-    td["is_init"], done = (td["step"] == 0).unsqueeze(-1), (td["step"] == length - 1).unsqueeze(-1)
-    td["next"] = TensorDict(done=done, terminated=done, truncated=torch.zeros_like(done), batch_size=[length])
-    return td
-
-
 def start_counts(sampling):
     """How often slices of 2 start at each step of one episode of 2 and one of 8 steps."""
     torch.manual_seed(0)
@@ -133,6 +82,46 @@ def test_sampling_by_steps_starts_anywhere_alike():
 def test_sampling_by_episodes_picks_an_episode_first():
     shares = start_counts("episodes")
     assert shares[:2].sum().item() == pytest.approx(0.5, abs=0.05)
+
+
+class TestRandomEpisodes:
+    def fill(self, sampler, num_envs, batches):
+        buffer = make_sequence_buffer(40 * num_envs, slice_len=4, batch_size=64, num_envs=num_envs, sampling="episodes")
+        buffer._sampler, stream = sampler or buffer._sampler, Stream(num_envs)
+        for _ in range(batches):
+            buffer.extend(stream.take(11))
+        return buffer
+
+    @pytest.mark.parametrize("batches", [2, 6], ids=["before", "after"])
+    def test_the_slices_are_those_of_torchrls_sampler(self, batches):
+        torchrls = SliceSampler(
+            slice_len=4, traj_key=("collector", "traj_ids"), init_key=None, strict_length=False, pad_output=True
+        )
+        drawn = []
+        for sampler in (torchrls, None):
+            buffer = self.fill(sampler, 3, batches)
+            torch.manual_seed(0)
+            drawn.append(sample_sequences(buffer, 4).select("step", ("collector", "traj_ids"), ("collector", "mask")))
+        assert (drawn[0] == drawn[1]).all()
+
+    def test_where_they_begin_does_not_depend_on_what_is_drawn_beyond(self):
+        starts = []
+        for lookahead in (0, 3):
+            torch.manual_seed(0)
+            buffer = make_sequence_buffer(
+                60, slice_len=3, batch_size=400, num_envs=3, sampling="episodes", lookahead=lookahead
+            )
+            buffer.extend(Stream(3).take(20))
+            sequences = sample_sequences(buffer, 3 + lookahead)
+            starts.append(sequences[:, 0].select("step", ("collector", "traj_ids")))
+        assert (starts[0] == starts[1]).all()
+        check_sequences(sequences, 6, newest=set(zip(*last_steps(buffer), strict=True)))
+        assert not sequences["collector", "mask"].all() and sequences["collector", "mask"][:, 3:].any()
+
+
+def last_steps(buffer):
+    newest = buffer.storage[buffer.storage._last_cursor_index]
+    return newest["collector", "traj_ids"].tolist(), newest["step"].tolist()
 
 
 class TestWholeEpisodes:
@@ -181,6 +170,8 @@ def test_the_device_is_that_of_the_storage():
         ({"batch_size": 0}, "batch_size must be >= 1.*got 0; "),
         ({"capacity": 3}, "capacity must hold at least slice_len=4 .* of each of 1 environments, got 3; "),
         ({"capacity": 11, "num_envs": 3}, "capacity must hold at least slice_len=4 .* 3 environments, got 11; "),
+        ({"capacity": 6, "lookahead": 3}, "slice_len=4 transitions and 3 beyond of each of 1 environments, got 6"),
+        ({"lookahead": -1}, "lookahead must be >= 0 transitions, got -1; use 0"),
         ({"sampling": "rows"}, "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),
         ({"sampling": "episode_starts"}, "sampling must be 'steps', .* for rows, got 'episode_starts'"),
     ],
@@ -189,6 +180,71 @@ def test_wrong_values(settings, message):
     settings = {"capacity": 100, "slice_len": 4, "batch_size": 2} | settings
     with pytest.raises(ValueError, match=message):
         make_sequence_buffer(settings.pop("capacity"), **settings)
+
+
+class TestRoomForStarts:
+    """Whether the smallest capacity that is accepted always holds a sequence, and a smaller one may not."""
+
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    @pytest.mark.parametrize(("slice_len", "lookahead"), [(4, 0), (3, 2), (13, 0)])
+    def test_one_that_is_accepted_never_runs_out(self, sampling, slice_len, lookahead):
+        needed = 9 + (min(slice_len + lookahead, 9) if sampling == "whole_episodes" else slice_len + lookahead) - 1
+        make = partial(
+            make_sequence_buffer,
+            slice_len=slice_len,
+            lookahead=lookahead,
+            batch_size=1,
+            num_envs=1,
+            sampling=sampling,
+            episode_len=9,
+        )
+        with pytest.raises(
+            ValueError, match=f"hold an episode of 9 and slice_len={slice_len} .*; use at least {needed}"
+        ):
+            make(needed - 1)
+        for exponent in (None, 0.9):
+            buffer, episode = make(needed, priority_exponent=exponent), None
+            for number in range(6):
+                episode = one_episode(number, 9)
+                for step in episode:
+                    buffer.extend(step.reshape(1, 1))
+                    assert buffer.can_sample() or not buffer.is_full()
+            assert buffer.is_full()
+
+    def test_with_one_step_less_there_is_none_at_times(self):
+        buffer = make_sequence_buffer(11, slice_len=4, batch_size=1, num_envs=1, sampling="episode_starts")
+        able = []
+        for number in range(6):
+            for step in one_episode(number, 9):
+                buffer.extend(step.reshape(1, 1))
+                able.append(buffer.can_sample())
+        assert able[:4] == [False, False, False, True] and 0 < sum(not each for each in able[20:]) < 5
+
+    def test_nothing_is_asked_where_no_length_is_known_or_sequences_begin_anywhere(self):
+        make_sequence_buffer(4, slice_len=4, batch_size=1, num_envs=1, sampling="episode_starts")
+        make_sequence_buffer(4, slice_len=4, batch_size=1, num_envs=1, sampling="steps", episode_len=9)
+
+
+@pytest.mark.parametrize("sampling", [*PADDED, "episode_starts"])
+@pytest.mark.parametrize("exponent", [None, 0.9])
+def test_whether_a_sequence_can_be_drawn_is_known_before_it_is(sampling, exponent):
+    if sampling == "episodes" and exponent:
+        return
+    stream, able = Stream(2), []
+    buffer = make_sequence_buffer(
+        16, slice_len=5, batch_size=4, num_envs=2, sampling=sampling, priority_exponent=exponent
+    )
+    assert not buffer.can_sample()
+    for _ in range(40):
+        buffer.extend(stream.take(1))
+        able.append(buffer.can_sample())
+        if able[-1]:
+            sample_sequences(buffer, 5)
+        else:
+            with pytest.raises(RuntimeError, match=r"no stored (start|episode|step)"):
+                sample_sequences(buffer, 5)
+    if sampling == "episode_starts":
+        assert 5 < sum(able) < 38
 
 
 @pytest.mark.parametrize("sampling", [*PADDED, "episode_starts"])
