@@ -9,7 +9,13 @@ from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.data import FROM_STARTS, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
+from hdrqn_torchrl.modules import (
+    EpsilonGreedy,
+    RepeatingEpsilonGreedy,
+    SuccessEpsilonGreedy,
+    compact_network,
+    paper_network,
+)
 
 NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
 
@@ -589,12 +595,50 @@ class TestRepeatedActions:
         steps = collect(algorithm, env, 60)[0]
         left, action = steps["repeated_action"][..., 1], steps["action"]
         assert not left[steps["is_init"].squeeze(-1)].any()
-        goes_on = left[:, 1:] > 0
+        starts = steps["is_init" if name in ("drqn", "dqn") else "option_init"].squeeze(-1)
+        goes_on = (left[:, 1:] > 0) & ~starts[:, 1:]
         assert goes_on.float().mean() > 0.6
         assert (action[:, 1:] == action[:, :-1])[goes_on].all()
         for learner in algorithm.learners.values():
             learner.store(steps)
         assert torch.isfinite(learner.update(learner.sample())["loss"])
+
+    @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
+    def test_nor_over_options(self, name):
+        """Only every second option explores here: it must not pass its stretch on."""
+        torch.manual_seed(0)
+        env = small_env(16, max_steps=30, num_goals=2)
+        exploration = SuccessEpsilonGreedy(1.0, 0.0, max_repeats=15, exponent=0.01)
+        algorithm = build(name, env, sub_exploration=exploration, max_option_steps=3)
+        exploration.success.rates.copy_(torch.tensor([0.0, 1.0]))  # the second subgoal needs no exploring
+        actions, greedy = [], []
+        choose = exploration.extend
+
+        def listen(values, *others):
+            greedy.append(values.argmax(-1))
+            actions.append(choose(values, *others))
+            return actions[-1]
+
+        exploration.extend = listen
+        with set_exploration_type(ExplorationType.RANDOM):
+            steps = algorithm.transform(env).rollout(40, algorithm.policy, break_when_any_done=False)
+        mastered = steps["subgoal"] == 1
+        taken, best = steps["action"], torch.stack(greedy, 1)
+        assert (taken == best)[mastered].all() and not (taken == best)[~mastered].all()
+        assert not steps["next", "repeated_action"][mastered][:, 1].any()
+        starts = steps["option_init"].squeeze(-1)
+        assert (steps["repeated_action"][..., 1] > 0)[starts & mastered].any()  # there was something to drop
+
+    @pytest.mark.parametrize("kind", [RepeatingEpsilonGreedy, SuccessEpsilonGreedy])
+    @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
+    def test_subgoals_are_not_repeated(self, name, kind):
+        with pytest.raises(ValueError, match=f"exploration must be an EpsilonGreedy .* got {kind.__name__}: .*; use"):
+            build(name, small_env(), meta_exploration=kind())
+
+    @pytest.mark.parametrize("name", ["dqn", "drqn"])
+    def test_flat_agents_have_no_success_of_subgoals_to_go_by(self, name):
+        with pytest.raises(ValueError, match="exploration must not be a SuccessEpsilonGreedy without subgoals"):
+            build(name, small_env(), exploration=SuccessEpsilonGreedy())
 
     def test_a_greedy_policy_does_not_repeat(self):
         env = small_env(4)

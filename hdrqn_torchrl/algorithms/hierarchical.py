@@ -125,7 +125,6 @@ def make_hdrqn(
     available = available_key(env)
     masked = available is not None or (mask_reached and not repeatable_subgoals)
     mask_key = keys.SUBGOAL_MASK if masked else None
-    sub_exploration.set_num_subgoals(num_subgoals)
     meta_keys = _meta_input_keys(meta_input) if version == "v2" else [keys.OBSERVATION]
     meta_inputs = len(meta_keys) * architecture.hidden_size if version == "v2" else observation
 

@@ -122,7 +122,6 @@ def make_v3(
         predictor=predictor,
     )
     sub_exploration, meta_exploration = sub_exploration or RepeatingEpsilonGreedy(), meta_exploration or EpsilonGreedy()
-    sub_exploration.set_num_subgoals(num_subgoals)
     policy = AllSubgoalsPolicy(network, sub_exploration, meta_exploration).to(env.device)
     loss = AllSubgoalsLoss(
         policy,

@@ -18,7 +18,12 @@ from torchrl.modules import recurrent_mode
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.modules.controllers import first_state
-from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
+from hdrqn_torchrl.modules.exploration import (
+    EpsilonGreedy,
+    RepeatingEpsilonGreedy,
+    check_chooses_subgoals,
+    choose_action,
+)
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import Gaps, lstm_weights, restarting_lstm
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
@@ -197,6 +202,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         self.network = network
         self.sub_exploration = sub_exploration or EpsilonGreedy(0.0, 0.0)
         self.meta_exploration = meta_exploration or EpsilonGreedy(0.0, 0.0)
+        check_chooses_subgoals(self.meta_exploration, "meta_exploration")
+        self.sub_exploration.set_num_subgoals(network.num_subgoals)
         self.observation_key, self.previous_action_key, self.init_key = observation_key, previous_action_key, init_key
         self.option_init_key, self.active_subgoal_key, self.mask_key = option_init_key, active_subgoal_key, mask_key
         self.action_key, self.subgoal_key = action_key, subgoal_key
@@ -235,7 +242,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         chosen = self.meta_exploration(subgoal_value, mask)
         subgoal = torch.where(starts, chosen, tensordict.get(self.active_subgoal_key))
         wanted = values_of(action_value, subgoal)
-        action = choose_action(self.sub_exploration, wanted, tensordict, self.repeated_action_key, subgoal)
+        action = choose_action(self.sub_exploration, wanted, tensordict, self.repeated_action_key, subgoal, starts)
         tensordict.set(self.subgoal_key, subgoal).set(self.action_key, action)
         for key, value in ((self.hidden_key, hidden), (self.cell_key, cell), (self.previous_action_key, action)):
             tensordict.set(_next(key), value)

@@ -20,8 +20,14 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.modules.exploration import EpsilonGreedy, RepeatingEpsilonGreedy, choose_action
+from hdrqn_torchrl.modules.exploration import (
+    EpsilonGreedy,
+    RepeatingEpsilonGreedy,
+    check_chooses_subgoals,
+    choose_action,
+)
 from hdrqn_torchrl.modules.q_network import QNetwork, State
+from hdrqn_torchrl.modules.success import SuccessEpsilonGreedy
 
 
 class SubController(TensorDictModuleBase):
@@ -73,6 +79,13 @@ class SubController(TensorDictModuleBase):
                 f"and num_conditions={network.num_conditions}; set num_conditions to the number of subgoals."
             )
         self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
+        if subgoal_key is not None:
+            self.exploration.set_num_subgoals(network.num_conditions)
+        elif isinstance(exploration, SuccessEpsilonGreedy):
+            raise ValueError(
+                "exploration must not be a SuccessEpsilonGreedy without subgoals, whose success it depends on; use "
+                "RepeatingEpsilonGreedy or EpsilonGreedy."
+            )
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
         self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
@@ -112,7 +125,8 @@ class SubController(TensorDictModuleBase):
 
     def _choose(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
-        return choose_action(self.exploration, value, tensordict, self.repeated_action_key, subgoal)
+        starts = tensordict.get(self.init_key).squeeze(-1)
+        return choose_action(self.exploration, value, tensordict, self.repeated_action_key, subgoal, starts)
 
     def advance(self, tensordict: TensorDictBase, subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL) -> State:
         """LSTM state after one more observation, without a decision.
@@ -175,6 +189,7 @@ class MetaController(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
+        check_chooses_subgoals(self.exploration, "exploration")
         self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
         self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
         self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key

@@ -115,11 +115,12 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
     r"""Temporally extended epsilon-greedy (Dabney et al., 2021): a random action is kept for some steps.
 
     Their number n has the probability :math:`P(n) \propto n^{-\mu}`, up to ``max_repeats`` (a zeta distribution, cut).
-    A walk of single random steps rarely leaves its corner; this one does. The policy carries what is in progress.
+    A walk of single random steps rarely leaves its corner; this one does. The policy carries what is in progress. A
+    stretch ends with its option: the next one may be for a subgoal that needs no exploring any more.
 
     Args:
         start, end, anneal_frames, ladder: as in :class:`EpsilonGreedy`; epsilon is the share of random steps, not of
-            steps at which a random stretch starts.
+            steps at which a random stretch starts (a little more than that, where options cut stretches short).
         exponent: :math:`\mu`.
         max_repeats: longest stretch.
 
@@ -151,13 +152,16 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         self.register_buffer("_durations", durations / durations.sum(), persistent=False)
         self._mean_duration = (torch.arange(1, max_repeats + 1) * self._durations).sum().item()
 
-    def extend(self, action_value: Tensor, carried: Tensor, subgoal: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def extend(
+        self, action_value: Tensor, carried: Tensor, subgoal: Tensor | None = None, starts: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Chooses, given the stretch in progress.
 
         Args:
             action_value: Q-values ``[*, A]``.
             carried: random action in progress and the steps that it still lasts, ``[*, 2]`` int64.
             subgoal: the subgoal ``[*]`` that an action is chosen for.
+            starts: where an option starts, ``[*]`` bool: a stretch in progress is over.
 
         Returns:
             The choice ``[*]`` int64, and what to carry to the next step.
@@ -165,6 +169,8 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         greedy = action_value.argmax(-1)
         if exploration_type() != ExplorationType.RANDOM:
             return greedy, torch.zeros_like(carried)
+        if starts is not None:
+            carried = carried.masked_fill(starts.unsqueeze(-1), 0)
         action, left = carried.unbind(-1)
         share = self.epsilons(greedy, subgoal)
         begins = share / (share + (1.0 - share) * self._mean_duration)  # so that `share` of all steps are random
@@ -182,6 +188,7 @@ def choose_action(
     tensordict: TensorDictBase,
     repeated_action_key: NestedKey,
     subgoal: Tensor | None = None,
+    starts: Tensor | None = None,
 ) -> Tensor:
     """The choice of a policy in ``tensordict``, which carries the random stretch in progress, if there can be one.
 
@@ -191,15 +198,29 @@ def choose_action(
         tensordict: a :class:`RepeatingEpsilonGreedy` reads ``repeated_action_key`` and writes it under ``"next"``.
         repeated_action_key: ``[*, 2]`` int64.
         subgoal: the subgoal ``[*]`` that the action is chosen for.
+        starts: where an option starts, ``[*]`` bool.
 
     Returns:
         ``[*]`` int64.
     """
     if not isinstance(exploration, RepeatingEpsilonGreedy):
         return exploration(action_value, subgoal=subgoal)
-    action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key), subgoal)
+    action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key), subgoal, starts)
     tensordict.set(unravel_key(("next", repeated_action_key)), carried)
     return action
+
+
+def check_chooses_subgoals(exploration: EpsilonGreedy, name: str) -> None:
+    """Refuses what is made for actions where subgoals are chosen.
+
+    Raises:
+        ValueError: if ``exploration``, the argument ``name``, repeats its choices.
+    """
+    if isinstance(exploration, RepeatingEpsilonGreedy):
+        raise ValueError(
+            f"{name} must be an EpsilonGreedy where subgoals are chosen, got {type(exploration).__name__}: a choice "
+            "lasts for an option there, and is not made on the way to another subgoal; use EpsilonGreedy."
+        )
 
 
 def _random_choice(action_value: Tensor, mask: Tensor | None) -> Tensor:

@@ -108,7 +108,7 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
         self.window = window
 
     def set_num_subgoals(self, num_subgoals: int) -> None:
-        """Must be called before it chooses; the builders of hierarchical algorithms do."""
+        """Must be called before it chooses; the policies that explore with it do."""
         self.success = SubgoalSuccess(num_subgoals, window=self.window)
 
     def observe(self, batch: TensorDictBase) -> None:

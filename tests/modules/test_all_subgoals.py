@@ -204,7 +204,8 @@ class TestPolicy:
         policy = AllSubgoalsPolicy(make_network(), RepeatingEpsilonGreedy(0.0, 0.0))
         greedy = policy(root())["action"]
         other = (greedy + 1) % ACTIONS
-        td = root(repeated_action=torch.stack([other, torch.tensor([2, 1, 0])], -1))
+        stretches = torch.stack([other, torch.tensor([2, 1, 0])], -1)
+        td = root(repeated_action=stretches, option_init=torch.zeros(3, 1, dtype=torch.bool))
         with set_exploration_type(ExplorationType.RANDOM):
             out = policy(td)
         assert out["action"].tolist() == [other[0], other[1], greedy[2]]

@@ -203,6 +203,18 @@ class TestRepeatingEpsilonGreedy:
         assert shares[:100].mean().item() == pytest.approx(0.47, abs=0.03)
         assert shares[-100:].mean().item() == pytest.approx(0.13, abs=0.03)
 
+    def test_a_stretch_ends_where_an_option_starts(self):
+        carried, starts = torch.tensor([[2, 5], [2, 5], [2, 1]]), torch.tensor([False, True, False])
+        with set_exploration_type(ExplorationType.RANDOM):
+            choice, following = RepeatingEpsilonGreedy(0.0, 0.0).extend(VALUES.expand(3, 4), carried, None, starts)
+        assert choice.tolist() == [2, 1, 2] and following[:, 1].tolist() == [4, 0, 0]
+
+    def test_a_fixed_epsilon_holds_for_stretches_too(self):
+        exploration = RepeatingEpsilonGreedy(1.0, 1.0, ladder=3.0)
+        exploration.fixed = 0.25
+        choices, _ = self.play(exploration)
+        assert (choices[40:] != 0).float().mean().item() == pytest.approx(0.25, abs=0.02)
+
     @pytest.mark.parametrize(
         ("arguments", "message"),
         [
