@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -161,6 +163,8 @@ class Learner:
             scalars to report.
         lookahead: steps that a minibatch's sequences have beyond ``slice_len``.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
+        episode_len: largest number of transitions of an episode, if known (see
+            :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         refresh: applied to every minibatch before it is learned from.
         separate: parts of the network, by how the names of their parameters begin, that are optimised apart: with
             this share of the learning rate, and with gradients clipped by their own norm.
@@ -181,6 +185,7 @@ class Learner:
         loss: LossModule,
         lookahead: int = 0,
         num_envs: int | None = None,
+        episode_len: int | None = None,
         refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
         separate: Mapping[str, float] | None = None,
         samples_per_draw: int = 8,
@@ -207,6 +212,7 @@ class Learner:
             slice_len=self._sequence_len,
             batch_size=settings.batch_size * samples_per_draw,
             num_envs=num_envs,
+            episode_len=episode_len,
             sampling=settings.sampling,
             priority_exponent=settings.priority_exponent,
             importance_exponent=settings.importance_exponent,
@@ -215,7 +221,8 @@ class Learner:
         self._drawn: list[TensorDictBase] = []
         self.held = False
         """Whether it stores only; what it could have learned meanwhile is not made up for."""
-        self._warm_at = settings.warmup_frames  # or when the first transition came, if that is later
+        self._warm_at = settings.warmup_frames  # or when a sequence could be drawn, if that was later
+        self._has_warned = False
 
     @property
     def learning_rate(self) -> float:
@@ -229,23 +236,50 @@ class Learner:
             group["lr"] = share * self.learning_rate
 
     def store(self, batch: TensorDictBase) -> None:
-        """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``."""
+        """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``.
+
+        Raises:
+            ValueError: if the batch is not of the environments that the memory was built for.
+            NonFiniteError: as :meth:`check_finite`.
+        """
         self.check_finite()
+        if batch.ndim != 2:
+            raise ValueError(
+                f"batch must have the shape [N, T] of N environments and T steps, got {list(batch.shape)}; collect "
+                "from one batch of environments."
+            )
         self.frames += batch.numel()
         self._drawn = []
         self._set_learning_rate()
         transitions = self.extract(batch)
         if transitions is not None:
-            if not len(self.buffer):
-                self._warm_at = max(self._warm_at, self.frames - batch.numel())
             self.buffer.extend(transitions)
-        if self.held:
-            self._warm_at = max(self._warm_at, self.frames)
+        if self._frames_owed > 0 and (self.held or not self._can_draw()):
+            self._warm_at += math.ceil(self._frames_owed)
+
+    @property
+    def _frames_owed(self) -> float:
+        """Frames since the warm-up for which no updates were made."""
+        return self.frames - self._warm_at - self.updates * self.settings.frames_per_update
+
+    def _can_draw(self) -> bool:
+        """Whether the memory holds a sequence; warns once where it is full of others."""
+        if self.buffer.can_sample():
+            return True
+        if self.buffer.is_full() and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"capacity should be so large that a sequence of {self._sequence_len} transitions that begins where an "
+                f"episode does is always stored, got {self.settings.capacity}; nothing is learned while there is none: "
+                "raise it, use a smaller slice_len, or stored_state=True with sampling='steps'.",
+                stacklevel=3,
+            )
+        return False
 
     def updates_due(self) -> int:
-        """How many updates are owed for the frames seen so far."""
-        owed = int((self.frames - self._warm_at) / self.settings.frames_per_update)
-        return max(0, owed - self.updates) if len(self.buffer) else 0
+        """How many updates are owed for the frames seen so far; none while no sequence can be drawn."""
+        owed = int((self.frames - self._warm_at) / self.settings.frames_per_update) - self.updates
+        return owed if owed > 0 and self._can_draw() else 0
 
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len]``."""
@@ -325,7 +359,12 @@ class Learner:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it can't be what a learner of these settings returned.
+        """
+        self._check_counters(state)
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.buffer.load_state_dict(state["buffer"])
@@ -334,6 +373,22 @@ class Learner:
         self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
         if self.settings.precision == "auto":  # another machine might choose another one
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
+
+    def _check_counters(self, state: Mapping[str, Any]) -> None:
+        """Refuses counts that no training has: an update would be made for each one that is missing."""
+        for name in ("updates", "frames", "warm_at"):
+            value = state[name]
+            if not isinstance(value, int) or not 0 <= value < 2**53:
+                raise ValueError(
+                    f"the stored learner's {name} must be a whole number in [0, 2**53), got {value!r}; it is damaged: "
+                    "use another checkpoint."
+                )
+        owed = state["frames"] - state["warm_at"] - state["updates"] * self.settings.frames_per_update
+        if owed > max(self.settings.capacity, 1_000_000):
+            raise ValueError(
+                f"the stored learner's updates must make up for its frames, got {state['updates']} for "
+                f"{state['frames']}; load it with the frames_per_update that it was saved with, or use another one."
+            )
 
 
 def _group(parameters: Mapping[str, Parameter], separate: Mapping[str, float]) -> list[tuple[float, list[Parameter]]]:

@@ -1,3 +1,4 @@
+import warnings
 from copy import deepcopy
 
 import pytest
@@ -12,7 +13,7 @@ from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
 
 
-def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, separate=None, **settings):
+def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, separate=None, episode_len=None, **settings):
     torch.manual_seed(0)
     network = QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=2, hidden_size=6)
     controller = SubController(network, subgoal_key=None, init_key="is_init")
@@ -24,6 +25,7 @@ def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, separate=None,
         extract=keep,
         loss=make_recurrent_loss(controller, settings),
         num_envs=num_envs,
+        episode_len=episode_len,
         samples_per_draw=samples_per_draw,
         separate=separate,
     )
@@ -85,6 +87,61 @@ class TestUpdatesDue:
         learner = make_learner(extract=lambda batch: None)
         learner.store(make_batch())
         assert learner.frames == 16 and learner.updates_due() == 0
+
+
+class TestWhatCanNotBeDrawnYet:
+    """Sequences that begin where an episode does need a start that is followed by enough steps."""
+
+    @pytest.mark.parametrize("priority_exponent", [None, 0.9])
+    @pytest.mark.parametrize(
+        ("slice_len", "due"), [(4, [0, 2, 2, 2]), (6, [0, 0, 2, 2]), (7, [0, 0, 0, 2])], ids=lambda value: f"{value}"
+    )
+    def test_nothing_is_due_until_it_can_and_nothing_is_made_up_for(self, priority_exponent, slice_len, due):
+        """Batches of two steps, updates after every four frames: two of each batch."""
+        learner = make_learner(
+            sampling="episode_starts", slice_len=slice_len, frames_per_update=2, priority_exponent=priority_exponent
+        )
+        steps, found = make_batch(time=8), []
+        for start in range(0, 8, 2):
+            learner.store(steps[:, start : start + 2])
+            found.append(learner.updates_due())
+            for _ in range(found[-1]):
+                learner.update(learner.sample())
+        assert found == due
+
+    def test_a_memory_that_loses_its_last_start_waits_says_so_once_and_goes_on(self):
+        """Episodes of eight steps in a memory of six for each environment: at times there is none of three."""
+        learner = make_learner(sampling="whole_episodes", slice_len=3, frames_per_update=2, capacity=12)
+        steps = make_batch(time=24)
+        steps["is_init"] = (torch.arange(24) % 8 == 0).expand(2, 24).unsqueeze(-1).clone()
+        steps["next", "done"] = (torch.arange(24) % 8 == 7).expand(2, 24).unsqueeze(-1).clone()
+        steps["collector", "traj_ids"] = torch.arange(24) // 8 + 100 * torch.arange(2)[:, None]
+        found = []
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for start in range(24):
+                learner.store(steps[:, start : start + 1])
+                found.append(learner.updates_due())
+                for _ in range(found[-1]):
+                    learner.update(learner.sample())
+        assert found == [0 if time % 8 in (6, 7) else 1 for time in range(24)]
+        said = [str(each.message) for each in caught if "capacity should be so large" in str(each.message)]
+        assert len(said) == 1 and "a sequence of 3 transitions" in said[0] and "got 12; nothing is learned" in said[0]
+
+    def test_a_capacity_that_an_episode_does_not_fit_in_is_refused_at_once(self):
+        with pytest.raises(ValueError, match="capacity must hold an episode of 8 and slice_len=3 transitions of each"):
+            make_learner(sampling="episode_starts", slice_len=3, capacity=18, episode_len=8)
+        make_learner(sampling="episode_starts", slice_len=3, capacity=20, episode_len=8)
+
+    def test_a_level_that_is_held_after_its_first_updates_makes_up_for_nothing(self):
+        learner, found = make_learner(frames_per_update=8), []
+        for held in (False, True, True, False, False):
+            learner.held = held
+            learner.store(make_batch())
+            found.append(learner.updates_due())
+            for _ in range(found[-1]):
+                learner.update(learner.sample())
+        assert found == [2, 0, 0, 2, 2]
 
 
 class TestUpdate:
@@ -377,6 +434,13 @@ class Keep:
         self.batches = state["batches"]
 
 
+def stored_twice():
+    learner = make_learner(extract=Keep())
+    for _ in range(2):
+        learner.store(make_batch())
+    return learner
+
+
 class TestState:
     @pytest.mark.parametrize("priority_exponent", [None, 0.9])
     def test_a_copy_goes_on_alike(self, priority_exponent):
@@ -413,6 +477,36 @@ class TestState:
         for params in ("value_network_params", "target_value_network_params"):
             assert parameter_distance(*(getattr(learner.loss, params).data for learner in (first, second))) == 0
         assert first.optimizer.param_groups[0]["lr"] == second.optimizer.param_groups[0]["lr"] == second.learning_rate
+
+    @pytest.mark.parametrize("name", ["updates", "frames", "warm_at"])
+    @pytest.mark.parametrize("value", [-1, -(10**12), -1e12, 2**53, 0.5, float("nan"), None, "1"])
+    def test_counters_that_no_training_has_are_refused(self, name, value):
+        learner = stored_twice()
+        state = deepcopy(learner.state_dict())
+        state[name] = value
+        with pytest.raises(ValueError, match=rf"learner's {name} must be a whole number in \[0, 2\*\*53\), got"):
+            learner.load_state_dict(state)
+        assert learner.updates_due() == 1
+
+    def test_more_updates_than_a_training_can_owe_are_refused(self):
+        learner = stored_twice()
+        state = deepcopy(learner.state_dict()) | {"frames": 10**12}
+        with pytest.raises(ValueError, match="updates must make up for its frames, got 0 for 1000000000000"):
+            learner.load_state_dict(state)
+
+
+class TestShapes:
+    def test_a_batch_of_other_environments_is_refused(self):
+        learner = make_learner(num_envs=2)
+        learner.store(make_batch())
+        for batch in (make_batch(num_envs=3), make_batch(num_envs=1)):
+            with pytest.raises(
+                ValueError, match=r"transitions must have the shape \[2, T\] that this memory was built"
+            ):
+                learner.store(batch)
+        for batch in (make_batch()[0], make_batch().unsqueeze(0), make_batch().reshape(2, 2, 4)):
+            with pytest.raises(ValueError, match=r"batch must have the shape \[N, T\] of N environments and T steps"):
+                learner.store(batch)
 
 
 class TestNumbersThatAreNone:

@@ -430,3 +430,24 @@ class TestWholeRuns:
         load_policy(copy, tmp_path / "run" / "checkpoints", "last")
         assert all((value == weights[key]).all() for key, value in copy.state_dict().items())
         assert trainer.episodes >= 256 // 7 - 4
+
+
+@pytest.mark.parametrize(
+    ("name", "learner"),
+    [
+        ("v3", {"slice_len": 12}),
+        ("v3", {"slice_len": 12, "priority_exponent": 0.9}),
+        ("v3", {"slice_len": 7, "sampling": "whole_episodes", "priority_exponent": 0.9}),
+        ("v2", {"slice_len": 6, "sampling": "whole_episodes", "priority_exponent": 0.9}),
+        ("drqn", {"slice_len": 12, "sampling": "episode_starts"}),
+        ("drqn", {"slice_len": 6, "sampling": "whole_episodes"}),
+    ],
+    ids=str,
+)
+def test_updates_wait_until_there_is_a_sequence_to_draw(name, learner, tmp_path):
+    """Warm-up is over with the first batch of eight steps; later nothing is made up for."""
+    settings = {"warmup_frames": 0, "capacity": 100, "frames_per_update": 8}
+    trainer = make_training(tmp_path, name, learner=settings | learner, total_frames=192, evaluation_frames=1000)
+    trainer.train()
+    for level in trainer.algorithm.learners.values():
+        assert 8 <= level.updates <= 192 // 8
