@@ -146,6 +146,24 @@ def test_one_precision_for_all_learners(name):
     assert "precision must be 'auto', 'fp32' or 'bf16', got 'fp16'" in explain(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("chosen", "fine"),
+    [
+        (["env=gridworld", "algo=v3"], -0.5),  # where goals have an order
+        (["env=four_rooms", "algo=v3"], -0.5),
+        (["variant=v3"], -0.5),
+        (["variant=v3_free_passage"], 0.0),
+        (["env=gridworld", "algo=v3", "algo.wrong_subgoal_reward=-0.25"], -0.25),
+        (["env=montezuma", "algo=v3"], 0.0),
+        (["env=gridworld", "algo=v2"], 0.0),
+    ],
+    ids=str,
+)
+def test_what_another_subgoal_costs(chosen, fine):
+    with initialize_config_dir(CONF, version_base="1.3"):
+        assert compose("config", overrides=chosen).algo.wrong_subgoal_reward == fine
+
+
 VARIANTS = sorted(path.stem for path in (Path(CONF) / "variant").glob("*.yaml"))
 
 

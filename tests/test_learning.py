@@ -85,6 +85,7 @@ def test_v3_solves_a_small_room(sequences):
         memory_size=32,
         head_size=32,
         sub_gamma=0.9,
+        wrong_subgoal_reward=-0.5,
         sub_exploration=RepeatingEpsilonGreedy(1.0, 0.1, anneal_frames=10_000, max_repeats=4),
         meta_exploration=EpsilonGreedy(1.0, 0.1, anneal_frames=10_000),
     )

@@ -51,7 +51,7 @@ def make_v3(
     trace_decay: float = 0.8,
     all_subgoals: bool = True,
     intra_option: bool = True,
-    wrong_subgoal_reward: float = -0.5,
+    wrong_subgoal_reward: float = 0.0,
     hazard_reward: float = -1.0,
     max_option_steps: int | None = None,
     max_meta_target: float | None = None,
@@ -73,8 +73,11 @@ def make_v3(
         joint: whether the meta level trains the memory, too; ``False``: it reads the memory only, and its head has an
             optimiser of its own.
         meta_learning_rate: of that optimiser, following the same schedule; ``None``: ``learner.learning_rate``.
-        sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, wrong_subgoal_reward, hazard_reward,
-            max_meta_target, prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, max_meta_target,
+            prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        wrong_subgoal_reward: of the sub level, for attaining another subgoal than the one in question. Below 0 it keeps
+            the agent from spoiling what comes later (the grid tasks have -0.5); but where one subgoal is needed for
+            another, such as the key for the door, it forbids the only way: docs/v3.md has what was measured.
         max_option_steps: step limit of an option.
         prediction_steps: how many steps ahead, at most, the memory learns to predict what will be seen
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.

@@ -128,7 +128,7 @@ class AllSubgoalsLoss(LossModule):
         meta_gamma: float = 0.97,
         trace_decay: float = 0.8,
         reached_reward: float = 1.0,
-        wrong_subgoal_reward: float = -0.5,
+        wrong_subgoal_reward: float = 0.0,
         hazard_reward: float = -1.0,
         double: bool = True,
         all_subgoals: bool = True,

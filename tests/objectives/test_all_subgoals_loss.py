@@ -15,12 +15,13 @@ from hdrqn_torchrl.modules import AllSubgoalsPolicy, compact_network
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
 
 B, T, G, A = 12, 14, 3, 3
+FINE = {"wrong_subgoal_reward": -0.5}  # by default there is none
 DEFAULTS = {
     "sub_gamma": 0.95,
     "meta_gamma": 0.97,
     "trace_decay": 0.8,
     "reached_reward": 1.0,
-    "wrong_subgoal_reward": -0.5,
+    **FINE,
     "hazard_reward": -1.0,
     "double": True,
     "all_subgoals": True,
@@ -59,6 +60,7 @@ class Tables(nn.Module):
 
     def __init__(self, steps, subgoals=G, actions=A):
         super().__init__()
+        self.num_subgoals = subgoals
         self.action_value = nn.Parameter(torch.randn(steps, subgoals, actions))
         self.subgoal_value = nn.Parameter(torch.randn(steps, subgoals))
 
@@ -68,7 +70,7 @@ class Tables(nn.Module):
 
 def make_loss(steps=B * T, *, subgoals=G, actions=A, **settings):
     """A loss and its two tables; the target's values are others than the main ones."""
-    loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(steps, subgoals, actions)), **settings)
+    loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(steps, subgoals, actions)), **(FINE | settings))
     with torch.no_grad():
         for value in loss.target_policy_params.values(True, True):
             if value.numel() > 1:
@@ -459,7 +461,7 @@ class TestInTheEnvironment:
         env = small_env(8, max_steps=6, view=5)
         usual = {"sampling": "episode_starts", "slice_len": 10, "batch_size": 32, "learning_rate": 1e-2}
         settings = tiny_settings(**(usual | (settings or {})))
-        sizes = {"memory_size": 8, "head_size": 8, "prediction_steps": 0}
+        sizes = {"memory_size": 8, "head_size": 8, "prediction_steps": 0, **FINE}
         algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, **(sizes | options))
         self.learner = algorithm.learners["joint"]
         for batch in collect(algorithm, env, 20, batches=2):
