@@ -15,8 +15,10 @@
                     there is a screen, where the agent was (places.png)
     allowed_targets own builders that the run's settings may name, e.g. [my_package.MyEnv]
 
-Each figure is a mean over episodes; "intervals" are 95 % bootstrap intervals, "references" what scripted players
-achieve on the same task ("memory" has the agent's own view: the ceiling; "egocentric" must also find out where it is).
+Each figure is a mean over episodes. "intervals" are 95 % intervals over the episodes of this one agent (t; of rates
+Clopper and Pearson's; null where all episodes were alike): they do not say how agents of other seeds would do.
+"references" are what scripted players achieve on the same task ("memory" has the agent's own view: the ceiling;
+"egocentric" must also find out where it is).
 """
 
 from __future__ import annotations

@@ -8,13 +8,16 @@ out       what to write, by ending: .png .svg .pdf .csv; several in brackets
 kind      curves: the paper's four curves with greedy evaluations as points (default)
           greedy: greedy return, success, goals in order, steps; bars: final results
 columns   any columns of metrics.csv instead, one panel each: columns=greedy/return,greedy/success,sub/loss; with
-          kind=bars also how long it took: columns='wall_seconds until behaviour/return>=1.01'
+          kind=bars also how long it took: columns='wall_seconds until behaviour/return>=1.01', a mean only of groups
+          whose runs all got there
 x         frames (default), episodes, updates or wall_seconds
 by        what makes a group: algo (default), env, network, any setting (algo.sub.slice_len), several (algo,network),
           run (each run alone), or null (all together)
-center    mean (default) or iqm, the interquartile mean; either with a 95 % bootstrap interval over seeds
+center    mean (default) or iqm, the interquartile mean; either with a 95 % t interval over seeds (of the IQM after
+          Tukey and McLaughlin). One seed has none, nor have equal values; of two or three it is wide, and cut off
+          where it would make a panel more than twice as high
 smooth    moving average over so many log points, or over this share of a run if < 1 (default 0: none)
-pool      true: all tasks in one row of panels, runs resampled within their task (default: a row for each task)
+pool      true: all tasks in one row of panels; intervals are of seeds, not of tasks (default: a row for each task)
 ceilings  known (default): scripted players where they have been measured; simulate: play the others, which takes
           seconds for each task; none
 log_x     true: logarithmic axis
@@ -31,6 +34,7 @@ import sys
 from collections import Counter
 from dataclasses import dataclass
 from functools import lru_cache
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +46,7 @@ from configuration import SettingsError, command_line, read_choices
 from hdrqn_torchrl.comparison import FINALS, GREEDY, PAPER, Panel, plot_bars, plot_curves
 from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
 from hdrqn_torchrl.grouping import Entry, Row, differences, rows_of, task_key, task_of, value_of
-from hdrqn_torchrl.results import References, curve, find_runs, read_run, source_of
+from hdrqn_torchrl.results import References, Run, asks_for_a_time, curve, final_value, find_runs, read_run, source_of
 
 ALLOWED = {
     "kind": ("curves", "greedy", "bars"),
@@ -181,6 +185,7 @@ def sum_up(row: Row, panels: list[Panel], settings: Settings) -> TaskResults:
         options: dict[str, Any] = {"strata": [task_key(entry) for entry in entries], "center": settings.center}
         if settings.kind == "bars":
             estimates = estimate_finals(runs, columns, **options)
+            tell_who_is_missing(label, runs, columns)
         else:
             estimates = estimate_curves(runs, columns, axis=settings.x, smooth=settings.smooth, **options)
         references = common_references(everyone if settings.pool else entries, settings.ceilings)
@@ -199,6 +204,14 @@ def tell_about(label: str, entries: list[Entry], settings: Settings) -> None:
         note(f"note: {label}: several runs with seed {', '.join(dict.fromkeys(twice))}; each counts as one")
     if differing := differences(entries):
         note(f"note: {label} puts runs together that differ in {shortened(differing)}; by=... separates them")
+
+
+def tell_who_is_missing(label: str, runs: list[Run], columns: list[str]) -> None:
+    """Notes about times that not all runs of a group have."""
+    for column in filter(asks_for_a_time, columns):
+        reached = sum(isfinite(final_value(run, column)) for run in runs)
+        if reached < len(runs):
+            note(f"note: {label}: {reached} of {len(runs)} runs have {column}; without the others there is no mean")
 
 
 def shortened(names: list[str], number: int = 4) -> str:

@@ -238,7 +238,9 @@ def finals(groups: dict[str, list[Found]]) -> Results:
         runs = [each.entry.run for each in members if each.entry.run.summary]
         if runs:
             for name in QUANTITIES:
-                results.setdefault(name, {})[label] = np.array([final_value(run, f"greedy/{name}") for run in runs])
+                values = np.array([final_value(run, f"greedy/{name}") for run in runs])
+                if np.isfinite(values).any():
+                    results.setdefault(name, {})[label] = values[np.isfinite(values)]
     return results
 
 
@@ -279,11 +281,12 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
         results = [json.loads(path.read_text()) for path in (run.folder / "evaluations").glob("*.json")]
         for result in sorted(results, key=lambda each: (each["env"]["sticky"], each["epsilon"])):
             key = result["per_subgoal"][list(result["env"]["subgoals"]).index("key")]["attained"]
-            low, high = result["intervals"]["return_mean"]
+            interval = result["intervals"]["return_mean"]
+            reach = f"{interval[0]:.0f} to {interval[1]:.0f}" if interval else ""
             cells = (
                 *(label, value_of(member.entry, "seed"), f"{run.metrics['frames'][-1] / 1000:.0f}k"),
                 *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),
-                *(f"{result['return_mean']:.0f}", f"{low:.0f} to {high:.0f}", f"{key:.0%}"),
+                *(f"{result['return_mean']:.0f}", reach, f"{key:.0%}"),
                 *(f"{result['success_rate']:.0%}", f"{result['steps_mean']:.0f}", f"{result['episodes']}"),
                 commits_of([member]),
             )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -15,10 +15,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hdrqn_torchrl.results import Array, References, Run, curve, final_value
+from hdrqn_torchrl.intervals import CONFIDENCE, center_interval
+from hdrqn_torchrl.results import Array, References, Run, asks_for_a_time, curve, final_value
 
 Center = Literal["mean", "iqm"]
-RESAMPLES = 1000
+_CUT = {"mean": 0.0, "iqm": 0.25}
 
 
 @dataclass(frozen=True)
@@ -86,27 +87,37 @@ def align(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     return grid, np.stack(values)
 
 
-def center_of(values: Array, center: Center, axis: int = -1) -> Array:
-    """Mean, or interquartile mean: a quarter of the values is cut off at either end (of fewer than 4 none)."""
-    if center == "mean":
-        return values.mean(axis)
-    from scipy.stats import trim_mean
+def center_of(values: Array, center: Center) -> Array:
+    """Mean, or interquartile mean: a quarter of the values is cut off at either end (of fewer than 4 none).
 
-    return trim_mean(values, 0.25, axis=axis)
+    Args:
+        values: ``[*, R]``.
+        center: ``"mean"`` or ``"iqm"``.
+
+    Returns:
+        ``[*]``.
+    """
+    cut = int(_CUT[center] * values.shape[-1])
+    return np.sort(values, -1)[..., cut : values.shape[-1] - cut].mean(-1) if cut else values.mean(-1)
 
 
 def estimate(
-    x: Array, values: Array, *, strata: Sequence[str] | None = None, center: Center = "mean", confidence: float = 0.95
+    x: Array,
+    values: Array,
+    *,
+    strata: Sequence[str] | None = None,
+    center: Center = "mean",
+    confidence: float = CONFIDENCE,
 ) -> Estimate:
-    """Mean or IQM over runs with a bootstrap interval (percentiles of 1,000 resamples, always the same ones).
+    """Mean or IQM over runs with its t interval (:func:`~hdrqn_torchrl.intervals.center_interval`).
 
     A position counts where at least half of the runs of each stratum reach it. It has an interval where at least two
-    runs of each stratum do.
+    runs of each stratum do and not all of them have the same value.
 
     Args:
         x: positions ``[P]``.
         values: ``[R, P]``; NaN where a run does not reach. Runs without any value do not count.
-        strata: a name for each run; runs are resampled within their stratum only. ``None``: all in one.
+        strata: a name for each run; only differences within a stratum widen the interval. ``None``: all in one.
         center: ``"mean"`` or ``"iqm"``.
         confidence: level of the interval.
 
@@ -119,7 +130,7 @@ def estimate(
     members = [some & (named == name) for name in np.unique(named[some])]
     here = ~np.isnan(values)
     result = np.full((3, len(x)), np.nan)
-    for present in np.unique(here, axis=1).T:  # positions that the same runs reach go through scipy together
+    for present in np.unique(here, axis=1).T:  # positions that the same runs reach go together
         positions = (here == present[:, None]).all(0)
         samples = [values[np.ix_(present & member, positions)].T for member in members]
         needed = [-(-int(member.sum()) // 2) for member in members]
@@ -131,23 +142,8 @@ def estimate(
 
 def _center_and_interval(samples: list[Array], center: Center, confidence: float) -> Array:
     """``[3, P]``: center, low and high of samples ``[P, R]``, one for each stratum."""
-    value = center_of(np.concatenate(samples, -1), center)
-    if min(sample.shape[1] for sample in samples) < 2:
-        return np.stack([value, np.full_like(value, np.nan), np.full_like(value, np.nan)])
-    from scipy.stats import bootstrap
-
-    interval = bootstrap(
-        samples,
-        lambda *parts, axis: center_of(np.concatenate(parts, axis), center, axis),
-        n_resamples=RESAMPLES,
-        batch=max(1, 4_000_000 // sum(sample.size for sample in samples)),  # numbers in memory at once
-        vectorized=True,
-        axis=-1,
-        confidence_level=confidence,
-        method="percentile",
-        rng=np.random.default_rng(0),
-    ).confidence_interval
-    return np.stack([value, interval.low, interval.high])
+    interval = center_interval(samples, cut=_CUT[center], confidence=confidence)
+    return np.stack([center_of(np.concatenate(samples, -1), center), *interval])
 
 
 def estimate_curves(
@@ -180,12 +176,20 @@ def estimate_curves(
 def estimate_finals(
     runs: Sequence[Run], columns: Iterable[str], *, strata: Sequence[str] | None = None, center: Center = "mean"
 ) -> dict[str, Estimate]:
-    """Each column's estimate over the runs' final values, at one position; see :func:`estimate_curves`."""
+    """Each column's estimate over the runs' final values, at one position; see :func:`estimate_curves`.
+
+    A time until a level was reached has an estimate only if all runs did: those that were quick enough to be seen are
+    no sample of all.
+    """
     estimates = {}
     for column in columns:
         values = np.array([[final_value(run, column)] for run in runs])
         if np.isfinite(values).any():
-            estimates[column] = estimate(np.zeros(1), values, strata=strata, center=center)
+            each = estimate(np.zeros(1), values, strata=strata, center=center)
+            if asks_for_a_time(column) and not np.isfinite(values).all():
+                none = np.full(1, np.nan)
+                each = replace(each, value=none, low=none, high=none)
+            estimates[column] = each
     return estimates
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.intervals import CONFIDENCE, mean_interval, share_interval
 from hdrqn_torchrl.isolation import isolated
 
 _SUMMED = {
@@ -201,15 +202,16 @@ def columns(played: TensorDictBase) -> dict[str, Tensor]:
     }
 
 
-def summarise(played: TensorDictBase, *, confidence: float = 0.95) -> dict[str, Any]:
-    """Averages with bootstrap intervals, and what became of each subgoal.
+def summarise(played: TensorDictBase, *, confidence: float = CONFIDENCE) -> dict[str, Any]:
+    """Averages with intervals over episodes, and what became of each subgoal.
 
     Args:
         played: episodes of :func:`play`.
         confidence: of the intervals.
 
     Returns:
-        The entries of :func:`evaluate`; ``intervals``: the same names with ``[low, high]``; ``per_subgoal``: for each
+        The entries of :func:`evaluate`; ``intervals``: the same names with ``[low, high]``, of rates after Clopper and
+        Pearson, else t intervals, or ``None`` where all episodes were alike; ``per_subgoal``: for each
         subgoal ``attained`` (share of episodes in which it was) and, for hierarchical agents, ``options`` (per
         episode) and ``success_rate`` (share of its options that reached it; ``None`` if it was never chosen).
     """
@@ -223,21 +225,16 @@ def summarise(played: TensorDictBase, *, confidence: float = 0.95) -> dict[str, 
             reached = played["reached"][:, subgoal].sum().item()
             entry |= {"options": options / len(played), "success_rate": reached / options if options else None}
         result["per_subgoal"].append(entry)
-    result["intervals"] = {name: _interval(values, confidence) for name, values in figures.items()}
+    result["intervals"] = {name: _interval(name, values, confidence) for name, values in figures.items()}
     return result
 
 
-def _interval(values: Tensor, confidence: float) -> list[float]:
-    """Percentile bootstrap interval of the mean over episodes; the random numbers are fixed."""
-    from scipy.stats import bootstrap  # loading it takes a second; only summaries need it
-
+def _interval(name: str, values: Tensor, confidence: float) -> list[float] | None:
     sample = values.cpu().double().numpy()
-    if len(sample) < 2:
-        return [sample.mean().item()] * 2
-    result = bootstrap(
-        (sample,), numpy.mean, n_resamples=2_000, confidence_level=confidence, method="percentile", rng=0
-    )
-    return [result.confidence_interval.low.item(), result.confidence_interval.high.item()]
+    if name.endswith("_rate"):
+        return list(share_interval(sample.mean().item(), len(sample), confidence=confidence))
+    low, high = mean_interval(sample, confidence=confidence)
+    return None if numpy.isnan(low) else [low.item(), high.item()]
 
 
 def _play_once(env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[Observer]) -> TensorDictBase:

@@ -159,6 +159,11 @@ def source_of(column: str) -> str:
     return asked["column"] if asked else column
 
 
+def asks_for_a_time(column: str) -> bool:
+    """Whether a final value says when a level was reached: a run that never does has none, which is no gap in it."""
+    return _UNTIL.fullmatch(column) is not None
+
+
 def final_value(run: Run, column: str) -> float:
     """What a run came to.
 

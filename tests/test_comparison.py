@@ -60,12 +60,25 @@ def test_estimates_are_lines_with_bands(tmp_path, figures):
     assert solid(returns) == {"v2": [[0, 1], [100, 2], [200, 3]]}
     (band,) = [each for each in returns.collections if isinstance(each, PolyCollection)]
     box = band.get_datalim(returns.transData)
-    assert (box.ymin, box.ymax) == (0, 4)
+    assert (box.ymin, box.ymax) == pytest.approx((1 - 12.706, 3 + 12.706), abs=1e-3)
     assert returns.get_ylabel() == "reward per episode" and returns.get_xlabel() == "environment frames"
     assert success.get_ylabel() == "success (all goals in order)"
     assert returns.get_title(loc="left") == "gridworld" and figures[0].get_suptitle() == "heading"
     assert "v2 (2 seeds)" in legend_of(figures[0])
-    assert figures[0].legends[0].get_title().get_text() == "mean over seeds with 95 % bootstrap interval"
+    assert figures[0].legends[0].get_title().get_text() == "mean over seeds with 95 % t interval"
+
+
+@pytest.mark.parametrize("starts", [(0.0, 0.1), (0.0, 8.0)])
+def test_wide_intervals_do_not_flatten_the_curves(tmp_path, figures, starts):
+    """Those of two seeds reach 6 times as far as the seeds are apart."""
+    runs = [run_of(start) for start in starts]
+    plot_curves(one_task(group("v2", runs)), [tmp_path / "a.png"], panels=GREEDY[:1])
+    (axis,) = figures[0].axes
+    low, high = axis.get_ylim()
+    shown = 2 * 1.1  # from the first point to the last, with margins
+    assert high - low <= 2 * shown + 1e-6
+    if starts[1] < 1:
+        assert low < 0.05 - 6.3 * 0.1 and high > 2.05 + 6.3 * 0.1  # seen whole
 
 
 def test_a_curve_is_solid_as_far_as_all_runs_reach_and_dotted_beyond(tmp_path, figures):
@@ -83,9 +96,11 @@ def test_the_papers_curves_have_greedy_evaluations_as_points(tmp_path, figures):
     plot_curves(one_task(group("v2", runs)), [tmp_path / "a.png"])
     (axis,) = figures[0].axes  # there are no data for the three others
     assert solid(axis) == {"v2": [[0, 1], [100, 2], [200, 3]]}
-    points, _, bars = axis.containers[0]
+    (points,) = [line for line in axis.get_lines() if line.get_marker() == "o"]
     assert points.get_xydata().tolist() == [[100, 6], [200, 7]]
-    assert [segment[:, 1].tolist() for segment in bars[0].get_segments()] == [[5, 7], [6, 8]]
+    ((_, _, (bars,)),) = axis.containers
+    ends = [segment[:, 1].tolist() for segment in bars.get_segments()]
+    assert ends == [pytest.approx([height - 12.706, height + 12.706], abs=1e-3) for height in (6, 7)]
     assert {"greedy evaluation", "while training, with exploration"} <= set(legend_of(figures[0]))
 
 
@@ -175,8 +190,11 @@ def test_bars_have_intervals_and_a_dot_for_each_run(tmp_path, figures):
     bars = [container.patches[0] for container in axis.containers if hasattr(container, "patches")]
     assert [bar.get_height() for bar in bars] == [12, (11 + 5) / 2]
     assert [bool(bar.get_hatch()) for bar in bars] == [False, True]
-    intervals = [container[2][0].get_segments()[0][:, 1].tolist() for container in axis.containers[1::2]]
-    assert intervals == [[10, 14], [5, 11]]
+    intervals = [container[2][0].get_segments()[0][:, 1].tolist() for container in axis.containers[2:]]
+    assert intervals == [
+        pytest.approx([12 - 25.41, 12 + 25.41], abs=1e-2),
+        pytest.approx([8 - 38.12, 8 + 38.12], abs=1e-2),
+    ]
     dots = [line for line in axis.get_lines() if line.get_marker() == "o"]
     assert [dot.get_ydata()[0] for dot in dots] == [10, 14, 11, 5]
     assert [same_color(dot.get_markerfacecolor(), "white") for dot in dots] == [False, False, False, True]

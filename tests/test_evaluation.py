@@ -209,9 +209,22 @@ class TestIntervals:
         assert width(50) == pytest.approx(4 * 0.5 / 50**0.5, rel=0.3)  # 1.96 standard errors of a coin, twice
         assert width(800) == pytest.approx(width(50) / 4, rel=0.3)
 
-    def test_constant_figures_have_a_point(self):
+    def test_figures_that_never_differ_have_none(self):
         summary = summarise(play(pair_env(4), always_right(), episodes=4))
-        assert summary["intervals"]["intrinsic_mean"] == [0.0, 0.0]
+        assert summary["intervals"]["intrinsic_mean"] is None
+
+    def test_one_episode_has_none_but_of_rates(self):
+        intervals = summarise(play(pair_env(1), always_right(), episodes=1))["intervals"]
+        assert intervals["return_mean"] is None
+        assert intervals["success_rate"] in ([0.0, pytest.approx(0.975)], [pytest.approx(0.025), 1.0])
+
+    def test_a_rate_of_0_or_1_leaves_room(self):
+        """Between walls above and below nobody who goes up (0) moves."""
+        played = play(pair_env(50), always(0), episodes=100)
+        low, high = summarise(played)["intervals"]["success_rate"]
+        assert low == 0.0 and high == pytest.approx(1 - 0.025 ** (1 / 100))
+        played["success"] = torch.ones(100)
+        assert summarise(played)["intervals"]["success_rate"] == [pytest.approx(0.025 ** (1 / 100)), 1.0]
 
 
 def test_observers_see_every_step():

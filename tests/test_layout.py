@@ -9,8 +9,8 @@ import hdrqn_torchrl
 
 ORDER = (
     "keys", "devices", "run_files", "transforms", "envs", "modules", "objectives", "data", "collectors", "precision",
-    "finite", "learner", "legs", "phases", "algorithms", "isolation", "evaluation", "serialization", "checkpoint",
-    "interruption", "locking", "logging", "results",
+    "finite", "learner", "legs", "phases", "algorithms", "isolation", "intervals", "evaluation", "serialization",
+    "checkpoint", "interruption", "locking", "logging", "results",
     "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent

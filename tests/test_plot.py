@@ -105,7 +105,7 @@ def test_the_table_holds_estimates_by_hand(run, outputs):
     run("runs=outputs", "out=table.csv", "ceilings=none")
     rows = {(row["group"], row["metric"], row["x"]): row for row in table()}
     whole = rows["v2", "behaviour/return", "400"]
-    assert (whole["estimate"], whole["low"], whole["high"], whole["seeds"]) == ("4.5", "4", "5", "2")
+    assert (whole["estimate"], whole["low"], whole["high"], whole["seeds"]) == ("4.5", "-1.85310237", "10.8531024", "2")
     assert (whole["task"], whole["axis"]) == ("gridworld", "frames")
     beyond = rows["dqn", "behaviour/return", "400"]  # the second run has not got that far
     assert (beyond["estimate"], beyond["low"], beyond["seeds"]) == ("4", "", "1")
@@ -115,16 +115,20 @@ def test_the_table_holds_estimates_by_hand(run, outputs):
 def test_final_results_of_unfinished_runs_are_their_last_evaluation(run, outputs):
     _, err = run("runs=outputs", "out=table.csv", "kind=bars", "ceilings=none")
     returns = {row["group"]: row for row in table() if row["metric"] == "greedy/return"}
-    assert [returns["dqn"][name] for name in ("axis", "estimate", "low", "high")] == ["final", "1", "0.5", "1.5"]
+    last = [returns["dqn"][name] for name in ("axis", "estimate", "low", "high")]
+    assert last == ["final", "1", "-5.35310237", "7.35310237"]
     assert returns["v2"]["estimate"] == "2"
     assert "dqn: unfinished are 1 of 2 runs" in err and "v2: unfinished" not in err
 
 
 def test_how_long_it_took(run, outputs):
-    run("runs=outputs", "out=[table.csv,a.png]", "kind=bars", "columns=[wall_seconds until behaviour/return>=3]")
-    rows = {row["group"]: row for row in table()}
-    assert [rows[group]["estimate"] for group in ("v2", "dqn")] == ["151.25", "181.5"]  # v2: 181.5 and 121
-    assert rows["dqn"]["seeds"] == "1" and rows["v2"]["metric"] == "wall_seconds until behaviour/return>=3"
+    _, err = run(
+        "runs=outputs", "out=[table.csv,a.png]", "kind=bars", "columns=[wall_seconds until behaviour/return>=3]"
+    )
+    (row,) = table()
+    assert (row["group"], row["estimate"], row["seeds"]) == ("v2", "151.25", "2")  # 181.5 and 121
+    assert row["metric"] == "wall_seconds until behaviour/return>=3"
+    assert "dqn: 1 of 2 runs have wall_seconds until behaviour/return>=3;" in err  # the quicker one alone is no mean
 
 
 @pytest.mark.parametrize(
@@ -174,7 +178,7 @@ def test_pooled_tasks_share_only_the_ceilings_that_are_the_same(run, tmp_path, f
     returns, steps = reference_lines(figures[0])
     assert returns == [2.0, -0.91] and steps == [12.1, 48.8]  # planner and random, which have no view
     last = [row for row in table() if row["metric"] == "behaviour/return"][-1]
-    assert [last[name] for name in ("group", "estimate", "low", "high", "seeds")] == ["v2", "8", "8", "8", "4"]
+    assert [last[name] for name in ("group", "estimate", "low", "high", "seeds")] == ["v2", "8", "", "", "4"]
 
 
 def test_an_unmeasured_task_shows_the_ceiling_that_was_logged(run, tmp_path, figures):

@@ -69,10 +69,10 @@ def test_figures_tables_and_claims_of_a_study(run, outputs):
     assert "`python train.py -m experiment=gridworld` (runs that have not been made to their end yet: 12 of 18)" in text
     row = next(line for line in text.splitlines() if line.startswith("| v2 |"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
-    expected = "v2", "0, 1", "1.60", "1.60 to 1.61", "1.60", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
+    expected = "v2", "0, 1", "1.60", "1.54 to 1.67", "1.60", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
     assert tuple(cells) == expected
     assert "| hdqn | none finished |" in text
-    assert "| v2 takes about 22 steps | agrees | v2 21 |" in text
+    assert "| v2 takes 22 steps (within 1.5) | open | v2 21 |" in text
     assert "above hdqn" not in text  # it has not finished, so nothing is claimed of it
     for name in ("gridworld.png", "gridworld_greedy.png"):
         assert (Path("results") / name).stat().st_size > 100
@@ -84,8 +84,8 @@ def test_claims_are_held_against_finished_runs(run, outputs):
         make_run(outputs / f"done-{algo}", "experiment=gridworld", f"algo={algo}", score=score)
     run("runs=outputs", "out=results.md", "studies=gridworld")
     text = Path("results.md").read_text()
-    assert "| v2 above v1 | agrees | v2 1.6, v1 1.21 |" in text
-    assert "| hdqn above drqn and dqn | agrees (one seed) | hdqn 0.8, drqn 0.3, dqn 0.205 |" in text
+    assert "| v2 above v1 | agrees | v2 1.6 ± 0.0635, v1 1.21 ± 0.0635 |" in text
+    assert "| hdqn above drqn and dqn | open (one seed) | hdqn 0.8, drqn 0.3, dqn 0.205 ± 0.0635 |" in text
     assert "claims small" not in text  # of some studies alone there is no overview
 
 
@@ -93,7 +93,10 @@ def test_overview_of_all_claims(run, outputs):
     run("runs=outputs", "out=results.md")
     overview = Path("results.md").read_text().partition("<!-- claims small -->")[2]
     assert "| study | claim (of greedy play at the end) | | measured |\n|---|---|---|---|" in overview
-    assert "| All algorithms, gridworld, two goals | v2 above v1 | agrees | v2 1.6, v1 1.21 |" in overview
+    assert (
+        "| All algorithms, gridworld, two goals | v2 above v1 | agrees | v2 1.6 ± 0.0635, v1 1.21 ± 0.0635 |"
+        in overview
+    )
 
 
 def test_what_people_wrote_is_left_as_it_is(run, outputs):

@@ -16,6 +16,7 @@ from hdrqn_torchrl.comparison.panels import (
     GREY,
     Panel,
     add_legend,
+    beside_the_values,
     caption_of,
     distances,
     draw_references,
@@ -64,6 +65,10 @@ def plot_bars(
                 if panel.column in group.estimates:
                     _draw_bar(place, position, group, group.estimates[panel.column], colors[group.label], lying)
             draw_references(place, task.groups, panel.column, colors, lying)
+            with beside_the_values(place, lying):
+                for position, group in enumerate(task.groups):
+                    if panel.column in group.estimates:
+                        _draw_interval(place, position, group.estimates[panel.column], lying)
             finish_panel(place, panel, lying)
             _name_bars(place, [group.label for group in task.groups], lying, shown=not lying or place is row[0])
     unfinished = any(not run.summary for task in tasks for group in task.groups for run in group.runs)
@@ -77,13 +82,10 @@ def plot_bars(
 def _draw_bar(place: Axes, position: int, group: Group, final: Estimate, color: str, lying: bool) -> None:
     partly = not all(run.summary for run in group.runs)
     look: Any = {"color": color, "alpha": 0.75, "hatch": _HATCH if partly else "", "edgecolor": "white"}
-    error: Any = {"color": "black", "linestyle": "", "elinewidth": 1.4, "capsize": 2 if lying else 4, "zorder": 3}
     if lying:
         place.barh(position, final.value, 0.7, **look)
-        place.errorbar(final.value, position, xerr=distances(final), **error)
     else:
         place.bar(position, final.value, 0.7, **look)
-        place.errorbar(position, final.value, yerr=distances(final), **error)
     offsets = np.linspace(-0.22, 0.22, len(group.runs)) if len(group.runs) > 1 else [0.0]
     for run, value, offset in zip(group.runs, final.samples[:, 0], offsets, strict=True):
         at = (value, position + offset) if lying else (position + offset, value)
@@ -96,6 +98,14 @@ def _draw_bar(place: Axes, position: int, group: Group, final: Estimate, color: 
             markeredgewidth=0.6,
             zorder=4,
         )
+
+
+def _draw_interval(place: Axes, position: int, final: Estimate, lying: bool) -> None:
+    look: Any = {"color": "black", "linestyle": "", "elinewidth": 1.4, "capsize": 2 if lying else 4, "zorder": 3}
+    if lying:
+        place.errorbar(final.value, position, xerr=distances(final), **look)
+    else:
+        place.errorbar(position, final.value, yerr=distances(final), **look)
 
 
 def _name_bars(place: Axes, labels: Sequence[str], lying: bool, *, shown: bool) -> None:

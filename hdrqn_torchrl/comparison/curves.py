@@ -16,6 +16,7 @@ from hdrqn_torchrl.comparison.panels import (
     PAPER,
     Panel,
     add_legend,
+    beside_the_values,
     caption_of,
     distances,
     draw_references,
@@ -74,6 +75,9 @@ def plot_curves(
             for group in task.groups:
                 _draw_group(place, group, panel, scale, styles[group.label])
             draw_references(place, task.groups, panel.column, {label: style[0] for label, style in styles.items()})
+            with beside_the_values(place):
+                for group in task.groups:
+                    _draw_intervals(place, group, panel, scale, styles[group.label][0])
             finish_panel(place, panel)
             place.set_xlabel(unit if task is tasks[-1] else "")
             if log_x:
@@ -105,6 +109,14 @@ def _draw_group(place: Axes, group: Group, panel: Panel, scale: float, style: tu
         _draw_points(place, points, scale, color, marker)
 
 
+def _draw_intervals(place: Axes, group: Group, panel: Panel, scale: float, color: str) -> None:
+    if line := group.estimates.get(panel.column):
+        place.fill_between(line.x * scale, line.low, line.high, color=color, alpha=0.18, linewidth=0)
+    if panel.points and (points := group.estimates.get(panel.points)):
+        look: Any = {"fmt": "none", "ecolor": color, "elinewidth": 0.8, "errorevery": _every(points), "zorder": 3}
+        place.errorbar(points.x * scale, points.value, yerr=distances(points), **look)
+
+
 def _has_markers(panel: Panel) -> bool:
     return panel.points is None and panel.column.startswith("greedy/")
 
@@ -116,7 +128,6 @@ def _draw_curve(place: Axes, label: str, line: Estimate, scale: float, color: st
         marks = {"marker": "_", "markersize": 8, "markeredgewidth": 1.6}  # one point makes no line
     place.plot(x, line.value, color=color, linewidth=1.2, linestyle=":", **marks)
     place.plot(x, np.where(reached(line), line.value, np.nan), color=color, linewidth=1.6, label=label)
-    place.fill_between(x, line.low, line.high, color=color, alpha=0.18, linewidth=0)
 
 
 def _every(line: Estimate) -> int:
@@ -125,20 +136,8 @@ def _every(line: Estimate) -> int:
 
 
 def _draw_points(place: Axes, points: Estimate, scale: float, color: str, marker: str) -> None:
-    place.errorbar(
-        points.x * scale,
-        points.value,
-        yerr=distances(points),
-        linestyle="",
-        color=color,
-        marker=marker,
-        markersize=3.5,
-        markeredgewidth=0,
-        elinewidth=0.8,
-        errorevery=_every(points),
-        markevery=_every(points),
-        zorder=3,
-    )
+    look: Any = {"marker": marker, "markersize": 3.5, "markeredgewidth": 0, "markevery": _every(points), "zorder": 3}
+    place.plot(points.x * scale, points.value, linestyle="", color=color, **look)
 
 
 def _group_handle(label: str, style: tuple[str, str], panels: Sequence[Panel]) -> Line2D:
