@@ -64,7 +64,8 @@ class LearnerSettings:
         importance_exponent: beta: weights ``priority**(-alpha * beta)`` make up for it in the loss; 1: in full.
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
-        max_target: largest return there can be, if known; targets are cut off above it.
+        max_target: largest return there can be; targets are cut off above it. ``None``: what the task states, if it
+            states one; ``math.inf``: they are not cut off.
         trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
         n_step: rewards of a target; 1: one-step targets.
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (see :func:`~hdrqn_torchrl.precision.choose_precision`).

@@ -127,13 +127,7 @@ class Trainer:
         finished = self._tracker.finished(batch)
         self.episodes += len(finished)
         self._window.add_episodes(finished)
-        for learner in self.algorithm.learners.values():
-            learner.store(batch)
-        for exploration in self.algorithm.explorations.values():
-            exploration.step(batch.numel())
-            exploration.observe(batch)
-        if self.algorithm.phases is not None:
-            self.algorithm.phases.observe(batch)
+        self.algorithm.observe(batch)
 
     def _complete_iteration(self) -> None:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""

@@ -1,3 +1,4 @@
+import math
 from copy import deepcopy
 from functools import cache
 
@@ -5,10 +6,11 @@ import pytest
 import torch
 from helpers import ALGORITHMS, build, collect, make_collector, parameter_distance, small_env, tiny_settings
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+from user_envs import Corridor
 
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.data import FROM_STARTS, make_sequence_buffer, sample_sequences
-from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.envs import MultiGoalGridEnv, Task
 from hdrqn_torchrl.modules import (
     EpsilonGreedy,
     RepeatingEpsilonGreedy,
@@ -98,6 +100,11 @@ def test_the_policy_is_made_of_what_the_learners_train(name):
     assert epsilons <= {id(buffer) for buffer in algorithm.policy.buffers()}
 
 
+def unbounded():
+    """Settings of a learner whose targets may be any number."""
+    return tiny_settings(max_target=math.inf)
+
+
 def value_everything_at(learner, value):
     """Makes the target network's Q-values the same everywhere."""
     streams = learner.loss.target_value_network_params["network", "head", "streams"]
@@ -105,6 +112,55 @@ def value_everything_at(learner, value):
         for parameter in streams.values():
             parameter.zero_()
         streams["bias"][0] = value
+
+
+class TestBoundsOfTargets:
+    """Only what the task states bounds what its agents hope for."""
+
+    def bound(self, algorithm, level):
+        loss = algorithm.learners[level].loss
+        return getattr(loss, "max_meta_target" if level == "joint" else "max_target")
+
+    @pytest.mark.parametrize(("name", "level"), [("dqn", "flat"), ("drqn", "flat"), ("v1", "meta"), ("v2", "meta")])
+    def test_the_grid_states_that_a_goal_pays_one(self, name, level):
+        algorithm = build(name, small_env(2, num_goals=3))
+        assert self.bound(algorithm, level) == 3.0
+        settings = tiny_settings(max_target=0.5)
+        assert self.bound(build(name, small_env(2), settings=settings), level) == 0.5
+
+    def test_the_grid_bounds_v3_on_both_sides(self):
+        loss = build("v3", small_env(2, num_goals=3)).learners["joint"].loss
+        assert (loss.min_meta_target, loss.max_meta_target, loss.max_sub_target) == (0.0, 3.0, 1.0)
+        assert build("v3", small_env(2), max_meta_target=0.5).learners["joint"].loss.max_meta_target == 0.5
+
+    @pytest.mark.parametrize(("rewards", "bound"), [({}, 1.0), ({"wrong_subgoal_reward": 0.5}, math.inf)])
+    def test_reaching_a_subgoal_pays_one_unless_more_is_paid(self, rewards, bound):
+        assert self.bound(build("v2", small_env(2), **rewards), "sub") == bound
+        assert build("v3", small_env(2), **rewards).learners["joint"].loss.max_sub_target == bound
+
+    @pytest.mark.parametrize("name", ["dqn", "v1", "v3"])
+    def test_an_environment_that_says_nothing_is_not_bounded_by_the_name_of_an_argument(self, name):
+        level = {"dqn": "flat", "v1": "meta", "v3": "joint"}[name]
+        env = Corridor(4, num_goals=2, pays=10.0, without=("success",))
+        torch.manual_seed(0)
+        options = {"settings": tiny_settings(learning_rate=0.03, tau=0.2)}
+        algorithm = build(name, env, **options, **({"meta_gamma": 1.0} if name == "v3" else {"gamma": 1.0}))
+        assert self.bound(algorithm, level) == math.inf
+        learner = algorithm.learners[level]
+        for batch in collect(algorithm, env, 16, 4):
+            learner.store(batch)
+        for _ in range(300):
+            learner.update(learner.sample())
+        value = "meta_q_value" if name == "v3" else "q_value"
+        assert learner.update(learner.sample())[value] > 4.0
+
+    def test_what_a_user_s_environment_states_bounds_its_agents(self):
+        task = Task(largest_return=40.0, largest_extrinsic_return=20.0, smallest_extrinsic_return=-5.0)
+        env = Corridor(4, pays=10.0, without=("success",), task=task)
+        assert self.bound(build("drqn", env), "flat") == 40.0
+        assert self.bound(build("v2", env), "meta") == 20.0
+        loss = build("v3", env).learners["joint"].loss
+        assert (loss.min_meta_target, loss.max_meta_target) == (-5.0, 20.0)
 
 
 class TestOptions:
@@ -142,7 +198,7 @@ class TestOptions:
 
     @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
     def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):
-        algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount)
+        algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount, settings=unbounded())
         meta = algorithm.learners["meta"]
         options = meta.extract(batch)[None, :1]
         options["next", "terminated"].fill_(False)
@@ -153,7 +209,7 @@ class TestOptions:
         assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
 
     def test_for_the_sub_controller_a_reached_subgoal_is_the_end_and_a_time_limit_is_not(self):
-        algorithm, batch = self.steps(gamma=0.5, max_option_steps=2)
+        algorithm, batch = self.steps(gamma=0.5, max_option_steps=2, settings=unbounded())
         sub, after = algorithm.learners["sub"], batch["next"]
         value_everything_at(sub, 8.0)
         reached = after["subgoal_reached"] & ~after["terminated"]
@@ -175,7 +231,7 @@ class TestOptions:
 
     @pytest.mark.parametrize(("mask_reached", "following"), [(True, 2.0), (False, 8.0)])
     def test_a_subgoal_that_is_gone_has_no_part_in_the_meta_target(self, mask_reached, following):
-        algorithm, batch = self.steps(mask_reached=mask_reached, smdp_discount=False, gamma=0.5)
+        algorithm, batch = self.steps(mask_reached=mask_reached, smdp_discount=False, gamma=0.5, settings=unbounded())
         meta = algorithm.learners["meta"]
         options = meta.extract(batch)[:, None]
         options = options[~options["next", "terminated"].flatten()]
@@ -464,7 +520,7 @@ class TestV3:
             ("intra_option", False),
             ("wrong_subgoal_reward", -0.25),
             ("hazard_reward", -0.75),
-            ("max_meta_target", 2.0),
+            ("max_meta_target", 1.5),
         ],
     )
     def test_options_of_the_loss(self, name, value):

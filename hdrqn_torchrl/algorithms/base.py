@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, TransformedEnv
+from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
-from hdrqn_torchrl import keys
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
@@ -33,6 +35,28 @@ class Algorithm:
         """The environment as this algorithm sees it."""
         return TransformedEnv(env, self.make_transforms(), auto_unwrap=True)
 
+    def observe(self, batch: TensorDictBase) -> None:
+        """Takes in a collected batch ``[N, T]``: every learner stores it, schedules and phases go on.
+
+        Updates are then due (:meth:`Learner.updates_due`).
+        """
+        for learner in self.learners.values():
+            learner.store(batch)
+        for exploration in self.explorations.values():
+            exploration.step(batch.numel())
+            exploration.observe(batch)
+        if self.phases is not None:
+            self.phases.observe(batch)
+
+
+def copies_of(*transforms: Transform) -> Callable[[], Compose]:
+    """A function that makes copies of transforms, for one more environment; it can be sent to another process."""
+    return partial(_copy, transforms)
+
+
+def _copy(transforms: Sequence[Transform]) -> Compose:
+    return Compose(*deepcopy(transforms))
+
 
 def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:
     """The recurrent states that are stored with the steps: all or none.
@@ -50,6 +74,7 @@ def make_recurrent_loss(
     settings: LearnerSettings,
     *,
     gamma: float = 0.99,
+    largest_return: float = math.inf,
     loss_keys: Mapping[str, NestedKey | None] | None = None,
     prediction_weight: float = 0.1,
 ) -> RecurrentDQNLoss:
@@ -59,6 +84,7 @@ def make_recurrent_loss(
         network: the controller that is trained.
         settings: how it learns.
         gamma: discount of one environment step.
+        largest_return: bounds the targets where ``settings.max_target`` is ``None``.
         loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
         prediction_weight: of the error of the network's predictor, if it has one.
 
@@ -72,7 +98,7 @@ def make_recurrent_loss(
         train_exact_states=settings.train_exact_states,
         loss_function=settings.loss_function,
         double=settings.double,
-        max_target=settings.max_target,
+        max_target=largest_return if settings.max_target is None else settings.max_target,
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
         state_keys=stored_states(network, settings),
@@ -81,8 +107,3 @@ def make_recurrent_loss(
     )
     loss.set_keys(**(loss_keys or {}))
     return loss
-
-
-def available_key(env: EnvBase) -> NestedKey | None:
-    """The entry in which an environment says which subgoals are worth choosing, if it does."""
-    return None if env.observation_spec.get(keys.AVAILABLE, None) is None else keys.AVAILABLE

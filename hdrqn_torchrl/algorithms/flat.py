@@ -5,10 +5,11 @@ from __future__ import annotations
 from functools import partial
 
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, InitTracker
+from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import StepSelector
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, SubController
@@ -28,13 +29,17 @@ def make_drqn(
     """Flat recurrent Q-learning (Hausknecht and Stone, 2015) on the task's total reward.
 
     Args:
-        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``, ``action``
+            and ``reward``.
         architecture: networks.
         learner: how it learns.
         exploration: its schedule.
         gamma: discount of one step.
         recurrent: ``False`` gives DQN.
         prediction_steps, prediction_weight: as in :func:`make_v3`.
+
+    Raises:
+        ValueError: if the environment lacks something.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -43,9 +48,9 @@ def make_drqn(
         ['flat']
     """
     exploration = exploration or EpsilonGreedy()
-    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
+    has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", subgoals=False)
     network = architecture.q_network(
-        observation, num_actions=num_actions, recurrent=recurrent, prediction_steps=prediction_steps
+        has.observation, num_actions=has.num_actions, recurrent=recurrent, prediction_steps=prediction_steps
     )
     policy = SubController(network, exploration, subgoal_key=None, init_key=keys.IS_INIT).to(env.device)
     flat = Learner(
@@ -55,14 +60,20 @@ def make_drqn(
             root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
             next_keys=[keys.OBSERVATION, keys.REWARD],
         ),
-        loss=make_recurrent_loss(policy, learner, gamma=gamma, prediction_weight=prediction_weight),
-        num_envs=env.batch_size[0],
+        loss=make_recurrent_loss(
+            policy,
+            learner,
+            gamma=gamma,
+            largest_return=has.task.largest_return,
+            prediction_weight=prediction_weight,
+        ),
+        num_envs=has.num_envs,
     )
     return Algorithm(
         policy=policy,
         learners={"flat": flat},
         explorations={"flat": exploration},
-        make_transforms=lambda: Compose(InitTracker(), policy.make_tensordict_primer()),
+        make_transforms=copies_of(InitTracker(), policy.make_tensordict_primer()),
     )
 
 

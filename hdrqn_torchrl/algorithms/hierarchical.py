@@ -9,10 +9,11 @@ from typing import Literal
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, InitTracker
+from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, available_key, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import (
     FROM_STARTS,
     HindsightOptions,
@@ -25,7 +26,7 @@ from hdrqn_torchrl.data import (
 from hdrqn_torchrl.learner import Extract, Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.phases import PhaseOne, Phases
-from hdrqn_torchrl.transforms import SubgoalTransform
+from hdrqn_torchrl.transforms import SubgoalTransform, largest_intrinsic_return
 
 
 def make_hdrqn(
@@ -57,7 +58,9 @@ def make_hdrqn(
     r"""Hierarchical deep recurrent Q-learning (Algorithm 1).
 
     Args:
-        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``,
+            ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available`` and ``success`` are
+            used where they are.
         architecture: networks.
         version: what the meta-controller reads: ``"v1"`` the observation, ``"v2"`` the sub-controller's state.
         sub, meta: how each level learns.
@@ -85,8 +88,8 @@ def make_hdrqn(
         recurrent: ``False`` gives hDQN (with ``version="v1"``).
 
     Raises:
-        ValueError: if ``version`` or ``meta_input`` is unknown, v2 is asked for without recurrence, or
-            hindsight with n-step targets or priorities (sub level) or with stored states.
+        ValueError: if the environment lacks something, ``version`` or ``meta_input`` is unknown, v2 is asked for
+            without recurrence, or hindsight with n-step targets or priorities (sub level) or with stored states.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -120,10 +123,9 @@ def make_hdrqn(
                 "the subgoal it pursued, not to the one that is learned about."
             )
     sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
-    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
-    num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
-    available = available_key(env)
-    masked = available is not None or (mask_reached and not repeatable_subgoals)
+    has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", subgoals=True)
+    observation, num_actions, num_subgoals = has.observation, has.num_actions, has.num_subgoals
+    masked = has.available_key is not None or (mask_reached and not repeatable_subgoals)
     mask_key = keys.SUBGOAL_MASK if masked else None
     meta_keys = _meta_input_keys(meta_input) if version == "v2" else [keys.OBSERVATION]
     meta_inputs = len(meta_keys) * architecture.hidden_size if version == "v2" else observation
@@ -156,8 +158,9 @@ def make_hdrqn(
             num_subgoals=num_subgoals,
             hazard_reward=hazard_reward,
             wrong_subgoal_reward=wrong_subgoal_reward,
+            hazard_key=has.hazard_key,
         )
-        root_extra, next_extra = [keys.SUBGOAL_MASK], [keys.ATTAINED, keys.HAZARD]
+        root_extra, next_extra = [keys.SUBGOAL_MASK], [keys.ATTAINED, *has.hazard_keys]
     policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
     starts = [keys.IS_INIT] if sub.sampling in FROM_STARTS else []
     sub_learner = Learner(
@@ -179,6 +182,9 @@ def make_hdrqn(
             sub_controller,
             sub,
             gamma=gamma,
+            largest_return=largest_intrinsic_return(
+                hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
+            ),
             loss_keys={
                 "reward": keys.INTRINSIC_REWARD,
                 "done": keys.OPTION_DONE,
@@ -188,7 +194,7 @@ def make_hdrqn(
             },
             prediction_weight=prediction_weight,
         ),
-        num_envs=env.batch_size[0],
+        num_envs=has.num_envs,
         refresh=relabel,
     )
     meta_learner = Learner(
@@ -206,6 +212,7 @@ def make_hdrqn(
             meta_controller,
             meta,
             gamma=gamma,
+            largest_return=has.task.largest_extrinsic_return,
             loss_keys={
                 "action": keys.SUBGOAL,
                 "reward": keys.OPTION_RETURN,
@@ -216,24 +223,22 @@ def make_hdrqn(
         refresh=refresh,
     )
 
-    def make_transforms() -> Compose:
-        subgoals = SubgoalTransform(
-            num_subgoals,
-            gamma=option_gamma,
-            max_option_steps=max_option_steps,
-            hazard_reward=hazard_reward,
-            wrong_subgoal_reward=wrong_subgoal_reward,
-            repeatable=repeatable_subgoals,
-            available_key=available,
-        )
-        primers = [controller.make_tensordict_primer() for controller in (sub_controller, meta_controller)]
-        return Compose(InitTracker(), subgoals, *primers)
-
+    subgoals = SubgoalTransform(
+        num_subgoals,
+        gamma=option_gamma,
+        max_option_steps=max_option_steps,
+        hazard_reward=hazard_reward,
+        wrong_subgoal_reward=wrong_subgoal_reward,
+        repeatable=repeatable_subgoals,
+        available_key=has.available_key,
+        hazard_key=has.hazard_key,
+    )
+    primers = [controller.make_tensordict_primer() for controller in (sub_controller, meta_controller)]
     return Algorithm(
         policy=policy,
         learners={"sub": sub_learner, "meta": meta_learner},
         explorations={"sub": sub_exploration, "meta": meta_exploration},
-        make_transforms=make_transforms,
+        make_transforms=copies_of(InitTracker(), subgoals, *primers),
         phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, meta_learner),
     )
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, InitTracker
+from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, available_key, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, stored_states
+from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import (
@@ -61,7 +62,9 @@ def make_v3(
     """hDRQNv3, this project's own agent: one memory for the whole episode, all subgoals learn from every step.
 
     Args:
-        env: bare environment with batch size ``[N]`` and the keys of :mod:`hdrqn_torchrl.keys`.
+        env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``,
+            ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available`` and ``success`` are
+            used where they are.
         architecture: where the features come from.
         learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
             should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
@@ -73,8 +76,10 @@ def make_v3(
         joint: whether the meta level trains the memory, too; ``False``: it reads the memory only, and its head has an
             optimiser of its own.
         meta_learning_rate: of that optimiser, following the same schedule; ``None``: ``learner.learning_rate``.
-        sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, max_meta_target,
-            prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, prediction_weight: see
+            :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        max_meta_target: largest return of the task there can be; the meta level's targets are cut off above it.
+            ``None``: what the task states, if it states one; ``math.inf``: they are not cut off.
         wrong_subgoal_reward: of the sub level, for attaining another subgoal than the one in question. Below 0 it keeps
             the agent from spoiling what comes later (the grid tasks have -0.5); but where one subgoal is needed for
             another, such as the key for the door, it forbids the only way: docs/v3.md has what was measured.
@@ -83,8 +88,9 @@ def make_v3(
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
 
     Raises:
-        ValueError: if ``learner.sampling`` begins in mid-episode without ``stored_state``, where the memory would
-            start empty; or if ``learner`` has targets of its own (``max_target``, ``trace_decay``, ``n_step``).
+        ValueError: if the environment lacks something; if ``learner.sampling`` begins in mid-episode without
+            ``stored_state``, where the memory would start empty; or if ``learner`` has targets of its own
+            (``max_target``, ``trace_decay``, ``n_step``).
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -110,8 +116,8 @@ def make_v3(
     if joint and meta_learning_rate is not None:
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
     meta_rate = learner.learning_rate if meta_learning_rate is None else meta_learning_rate
-    observation, num_actions = env.observation_spec[keys.OBSERVATION], env.action_spec.n
-    num_subgoals = env.observation_spec[keys.ATTAINED].shape[-1]
+    has = check_environment(env, architecture, builder="make_v3", subgoals=True)
+    observation, num_actions, num_subgoals = has.observation, has.num_actions, has.num_subgoals
     predictor = None
     if prediction_steps:
         predictor = observation_predictor(observation, memory_size, num_actions, prediction_steps, width=head_size)
@@ -132,11 +138,12 @@ def make_v3(
         meta_gamma=meta_gamma,
         trace_decay=trace_decay,
         wrong_subgoal_reward=wrong_subgoal_reward,
-        hazard_reward=hazard_reward,
+        hazard_reward=0.0 if has.hazard_key is None else hazard_reward,
         double=learner.double,
         all_subgoals=all_subgoals,
         intra_option=intra_option,
-        max_meta_target=max_meta_target,
+        max_meta_target=has.task.largest_extrinsic_return if max_meta_target is None else max_meta_target,
+        min_meta_target=has.task.smallest_extrinsic_return,
         prediction_weight=prediction_weight,
         burn_in=learner.burn_in,
         train_exact_states=learner.train_exact_states,
@@ -153,7 +160,7 @@ def make_v3(
             keys.SUBGOAL_MASK,
             *stored_states(policy, learner),
         ],
-        next_keys=[keys.ATTAINED, keys.HAZARD, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
+        next_keys=[keys.ATTAINED, *has.hazard_keys, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
     )
     trained = Learner(
         policy,
@@ -161,25 +168,23 @@ def make_v3(
         extract=stored,
         loss=loss,
         lookahead=1,
-        num_envs=env.batch_size[0],
+        num_envs=has.num_envs,
         separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
     )
 
-    def make_transforms() -> Compose:
-        subgoals = SubgoalTransform(
-            num_subgoals,
-            gamma=meta_gamma,
-            max_option_steps=max_option_steps,
-            hazard_reward=hazard_reward,
-            wrong_subgoal_reward=wrong_subgoal_reward,
-            available_key=available_key(env),
-        )
-        return Compose(InitTracker(), subgoals, policy.make_tensordict_primer())
-
+    subgoals = SubgoalTransform(
+        num_subgoals,
+        gamma=meta_gamma,
+        max_option_steps=max_option_steps,
+        hazard_reward=hazard_reward,
+        wrong_subgoal_reward=wrong_subgoal_reward,
+        available_key=has.available_key,
+        hazard_key=has.hazard_key,
+    )
     return Algorithm(
         policy=policy,
         learners={"joint": trained},
         explorations={"sub": sub_exploration, "meta": meta_exploration},
-        make_transforms=make_transforms,
+        make_transforms=copies_of(InitTracker(), subgoals, policy.make_tensordict_primer()),
         phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, None),
     )

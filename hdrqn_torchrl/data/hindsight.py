@@ -29,7 +29,7 @@ def relabel_subgoals(
     state_keys: Sequence[NestedKey] = (),
     subgoal_key: NestedKey = keys.SUBGOAL,
     attained_key: NestedKey = keys.ATTAINED,
-    hazard_key: NestedKey = keys.HAZARD,
+    hazard_key: NestedKey | None = keys.HAZARD,
     mask_key: NestedKey = keys.SUBGOAL_MASK,
     option_init_key: NestedKey = keys.OPTION_INIT,
     option_done_key: NestedKey = keys.OPTION_DONE,
@@ -55,7 +55,8 @@ def relabel_subgoals(
         state_keys: recurrent states stored with the steps, if any. They come from the subgoal that was pursued; told
             for another one, a sequence starts from zero.
         subgoal_key: subgoal in force, at the root and under ``"next"``.
-        attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``.
+        attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``;
+            ``hazard_key=None``: no hazard.
         mask_key, option_init_key: at the root.
         eligible_key: written at the root, for :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss`.
 
@@ -80,7 +81,7 @@ def relabel_subgoals(
     reward = intrinsic_reward(
         attained,
         reached,
-        after.get(hazard_key),
+        None if hazard_key is None else after.get(hazard_key),
         reached_reward=reached_reward,
         hazard_reward=hazard_reward,
         wrong_subgoal_reward=wrong_subgoal_reward,

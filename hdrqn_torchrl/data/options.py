@@ -73,7 +73,7 @@ class OptionExtractor:
         self.option_return_key, self.input_keys = option_return_key, list(input_keys)
         inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
         self._start_keys = [*inputs, *state_keys, init_key, traj_key]
-        self._end_keys = [*inputs, option_steps_key, option_return_key, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
+        self._end_keys = [*inputs, option_steps_key, option_return_key, keys.DONE, keys.TERMINATED]
         self.reset()
 
     def reset(self) -> None:
@@ -120,7 +120,7 @@ class OptionExtractor:
         if self.at_end is not None:
             after = self.at_end(after)
         options.set(self.subgoal_key, after.get(self.active_subgoal_key))
-        options.set("next", after.select(*self._end_keys))
+        options.set("next", select_after(after, self._end_keys))
         return options.set("environment", environment)
 
     def _release(self, options: TensorDictBase, num_envs: int) -> TensorDictBase | None:
@@ -158,6 +158,11 @@ class OptionExtractor:
             self.history.load_state_dict(state["history"])
 
 
+def select_after(after: TensorDictBase, wanted: Sequence[NestedKey]) -> TensorDictBase:
+    """What is kept of what followed; ``truncated`` as well, which not every environment has."""
+    return after.select(*wanted, *([keys.TRUNCATED] if keys.TRUNCATED in after else []))
+
+
 class StepSelector:
     """Keeps of collected steps ``[N, T]`` what the sub-controller (or a flat agent) learns from.
 
@@ -180,13 +185,13 @@ class StepSelector:
         traj_key: NestedKey = keys.TRAJ_IDS,
     ) -> None:
         self.root_keys, self.subgoal_key, self.active_subgoal_key = list(root_keys), subgoal_key, active_subgoal_key
-        self.next_keys = [*next_keys, keys.DONE, keys.TERMINATED, keys.TRUNCATED]
+        self.next_keys = [*next_keys, keys.DONE, keys.TERMINATED]
         self.traj_key = traj_key
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns steps ``[N, T]``."""
         steps = batch.select(*self.root_keys, self.traj_key)
-        after = batch.get("next").select(*self.next_keys)
+        after = select_after(batch.get("next"), self.next_keys)
         if self.subgoal_key is not None:
             in_force = batch.get(unravel_key(("next", self.active_subgoal_key)))
             steps.set(self.subgoal_key, in_force)

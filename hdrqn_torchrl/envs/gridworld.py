@@ -187,12 +187,19 @@ class MultiGoalGridEnv(EnvBase):
         """All worlds and the generator of their layouts: what a resumed run needs."""
         return {**self.state._asdict(), "steps": self.steps, "generator": self._generator.get_state()}
 
-    def load_state_dict(self, state_dict: dict[str, Tensor], *args, **kwargs) -> None:
+    def load_state_dict(self, state_dict: dict[str, Tensor], strict: bool = True) -> None:
         """Restores what :meth:`state_dict` returned.
+
+        Args:
+            state_dict: that.
+            strict: ``False``: nothing is restored where the state is not whole. (TorchRL's ``EnvCreator`` hands one
+                over that it has taken the tensors out of.)
 
         Raises:
             ValueError: if it is the state of another number of worlds.
         """
+        if not strict and "steps" not in state_dict:
+            return
         if len(state_dict["steps"]) != self.num_envs:
             raise ValueError(f"state_dict must hold {self.num_envs} worlds, got {len(state_dict['steps'])}.")
         self.state = GridState(*(state_dict[name].to(self.device) for name in GridState._fields))

@@ -265,12 +265,19 @@ class MontezumaEnv(EnvBase):
             "generator": self._generator.bit_generator.state,
         }
 
-    def load_state_dict(self, state_dict: dict[str, Any], *args, **kwargs) -> None:
+    def load_state_dict(self, state_dict: dict[str, Any], strict: bool = True) -> None:
         """Restores what :meth:`state_dict` returned.
+
+        Args:
+            state_dict: that.
+            strict: ``False``: nothing is restored where the state is not whole. (TorchRL's ``EnvCreator`` hands one
+                over that it has taken the tensors out of.)
 
         Raises:
             ValueError: if it is the state of another number of emulators.
         """
+        if not strict and "steps" not in state_dict:
+            return
         if len(state_dict["steps"]) != self.num_envs:
             raise ValueError(f"state_dict must hold {self.num_envs} emulators, got {len(state_dict['steps'])}.")
         for index, moment in enumerate(state_dict["emulators"]):

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from torchrl.data import Categorical, TensorSpec
+import torch
+from torchrl.data import Categorical, OneHot, TensorSpec
 
 from hdrqn_torchrl.modules.features import (
+    SMALLEST_IMAGE,
     CellFeatures,
     CellsToImage,
     ChainedFeatures,
@@ -28,12 +30,15 @@ class Architecture:
         observation_features: makes the feature extractor for an observation spec.
         vector_features: makes the feature extractor for a vector of given size (v2's meta-controller).
         gate_features: whether the subgoal scales the features beside being appended to them.
+        observation_problem: says of an observation's spec, and of its shape without the batch, what it must be if it
+            can't be read; ``None``: it can.
     """
 
     hidden_size: int
     gate_features: bool = False
     observation_features: Callable[[TensorSpec], Features]
     vector_features: Callable[[int], Features]
+    observation_problem: Callable[[TensorSpec, Sequence[int]], str | None] = lambda spec, shape: None
 
     def q_network(
         self,
@@ -82,6 +87,7 @@ def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Arc
         gate_features=gate_features,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, (256, 256, 256, 256)),
+        observation_problem=grid_or_image,
     )
 
 
@@ -106,6 +112,27 @@ def compact_network(
         gate_features=gate_features,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, tuple(widths)),
+        observation_problem=grid_or_image,
+    )
+
+
+def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> str | None:
+    """What an observation must be for :func:`paper_network` and :func:`compact_network`; ``None``: it is that.
+
+    Args:
+        spec: its spec.
+        shape: of it, without the batch.
+    """
+    square = len(shape) >= 2 and shape[-1] == shape[-2]
+    if type(spec) is Categorical and not spec.dtype.is_floating_point and len(shape) == 2 and square:
+        return None
+    image = spec.dtype in (torch.uint8, torch.float32) and not isinstance(spec, Categorical | OneHot)
+    if image and len(shape) == 3 and square and shape[-1] >= SMALLEST_IMAGE:
+        return None
+    return (
+        "must be a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] of "
+        f"S >= {SMALLEST_IMAGE} pixels, uint8 or float32 of about 1 (ToTensorImage, Resize and GrayScale make such "
+        "images); to read anything else, give Architecture(observation_features=...) a feature extractor for it"
     )
 
 

@@ -14,6 +14,8 @@ from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
 
 _USUAL_VIEW = 5
+SMALLEST_IMAGE = 33
+"""Side in pixels of the smallest image that four convolutions can read."""
 
 
 class Features(nn.Module):
@@ -84,7 +86,9 @@ class ConvFeatures(Features):
             layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU(inplace=True)]
             previous, side = width, (side - kernel) // stride + 1
         if side < 1:
-            raise ValueError(f"size must be >= 33 pixels for four convolutions, got {size}; the paper uses 44.")
+            raise ValueError(
+                f"size must be >= {SMALLEST_IMAGE} pixels for four convolutions, got {size}; the paper uses 44."
+            )
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # as oneDNN and cuDNN like it
         self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU(inplace=True))
         self.out_features = out_features

@@ -24,6 +24,7 @@ Memory: if the network has a predictor, it is also trained to tell what the next
 
 from __future__ import annotations
 
+import math
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Literal
@@ -48,6 +49,7 @@ from hdrqn_torchrl.objectives.targets import (
     training_mask,
     watkins_trace,
 )
+from hdrqn_torchrl.transforms import largest_intrinsic_return
 
 
 class AllSubgoalsLoss(LossModule):
@@ -72,8 +74,8 @@ class AllSubgoalsLoss(LossModule):
         intra_option: ``False``: the meta level learns from the steps at which options begin only, and of those whose
             end is in the sequence. (``True`` takes options to last until their subgoal is attained: a step limit of
             options is not seen.)
-        max_meta_target: largest return of the task there can be, if known and never negative; the meta level's targets
-            are kept between 0 and it.
+        max_meta_target, min_meta_target: largest and smallest return of the task there can be, if known; the meta
+            level's targets are kept between them.
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
             in sequences that begin where an episode does, every state is exact.
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
@@ -133,7 +135,8 @@ class AllSubgoalsLoss(LossModule):
         double: bool = True,
         all_subgoals: bool = True,
         intra_option: bool = True,
-        max_meta_target: float | None = None,
+        max_meta_target: float = math.inf,
+        min_meta_target: float = -math.inf,
         burn_in: float = 0.0,
         train_exact_states: bool = True,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
@@ -158,7 +161,11 @@ class AllSubgoalsLoss(LossModule):
         self.sub_gamma, self.meta_gamma, self.trace_decay = sub_gamma, meta_gamma, trace_decay
         self.reached_reward, self.wrong_subgoal_reward = reached_reward, wrong_subgoal_reward
         self.hazard_reward, self.double = hazard_reward, double
-        self.all_subgoals, self.intra_option, self.max_meta_target = all_subgoals, intra_option, max_meta_target
+        self.all_subgoals, self.intra_option = all_subgoals, intra_option
+        self.max_meta_target, self.min_meta_target = max_meta_target, min_meta_target
+        self.max_sub_target = largest_intrinsic_return(
+            reached_reward=reached_reward, hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
+        )
         self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
         self.state_keys = list(policy.state_keys) if stored_state else []
         self.prediction_weight = prediction_weight
@@ -299,9 +306,8 @@ class AllSubgoalsLoss(LossModule):
         following = torch.cat([sub_next, meta_next], -1)
         returns = lambda_returns(reward, ended, following, trace, discount)
         sub_target, meta_target = returns.chunk(2, -1)
-        if self.max_meta_target is not None:
-            meta_target = meta_target.clamp(min=0.0, max=self.max_meta_target)
-        return sub_target.clamp(max=self.reached_reward), meta_target, agrees[:, :-1]
+        meta_target = meta_target.clamp(min=self.min_meta_target, max=self.max_meta_target)
+        return sub_target.clamp(max=self.max_sub_target), meta_target, agrees[:, :-1]
 
     def _option_trace(self, subgoal_value: Tensor, tensordict: TensorDictBase, events: dict[str, Tensor]) -> Tensor:
         """Traces ``[B, T, G]`` along options: all inside them; lambda to the next one, if it is the greedy choice and

@@ -7,6 +7,7 @@ it like any other entry.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -278,6 +279,23 @@ def intrinsic_reward(
         others = attained.sum(-1, keepdim=True) > reached.long()
         reward = reward + wrong_subgoal_reward * others.float()
     return reward
+
+
+def largest_intrinsic_return(
+    *, reached_reward: float = 1.0, hazard_reward: float = -1.0, wrong_subgoal_reward: float = 0.0
+) -> float:
+    """Largest sum of intrinsic rewards that an option can bring: reaching the subgoal pays once, and ends it.
+
+    Where something else pays as well, there is no bound.
+
+    Args:
+        reached_reward, hazard_reward, wrong_subgoal_reward: as in :class:`SubgoalTransform`.
+
+    Examples:
+        >>> largest_intrinsic_return(), largest_intrinsic_return(wrong_subgoal_reward=0.5)
+        (1.0, inf)
+    """
+    return math.inf if max(hazard_reward, wrong_subgoal_reward) > 0.0 else max(reached_reward, 0.0)
 
 
 def _set_spec(composite: Composite, key: NestedKey, spec: TensorSpec) -> None:

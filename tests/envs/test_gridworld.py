@@ -3,7 +3,7 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import ParallelEnv, SerialEnv
+from torchrl.envs import EnvCreator, ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -231,3 +231,11 @@ def test_a_core_makes_a_million_steps_a_second():
             env.step(tensordict)
         best = min(best, (time.process_time() - start) / 20)
     assert 1024 / best >= 1_000_000
+
+
+def test_a_state_without_tensors_such_as_torchrl_s_creator_of_environments_makes_restores_nothing():
+    env = EnvCreator(lambda: MultiGoalGridEnv(2, max_steps=6, seed=3))()
+    fresh = MultiGoalGridEnv(2, max_steps=6, seed=3)
+    assert (env.state.objects == fresh.state.objects).all()
+    with pytest.raises(KeyError):
+        env.load_state_dict({})

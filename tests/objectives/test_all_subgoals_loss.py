@@ -26,7 +26,8 @@ DEFAULTS = {
     "double": True,
     "all_subgoals": True,
     "intra_option": True,
-    "max_meta_target": None,
+    "max_meta_target": math.inf,
+    "min_meta_target": -math.inf,
     "burn_in": 0.0,
     "train_exact_states": True,
     "loss_function": "l2",
@@ -47,6 +48,10 @@ CHANGES = [
     {"intra_option": False, "trace_decay": 0.0},
     {"intra_option": False, "double": False},
     {"max_meta_target": 0.4},
+    {"min_meta_target": 0.1},
+    {"max_meta_target": 0.4, "min_meta_target": 0.0},
+    {"wrong_subgoal_reward": 0.5},
+    {"hazard_reward": 0.5},
     {"burn_in": 0.5, "train_exact_states": False},
     {"loss_function": "smooth_l1"},
 ]
@@ -170,12 +175,13 @@ class Reference:
             if (t < int((self.steps - 1) * self.s.burn_in) and not exact) or t >= self.length[b]:
                 continue
             if self.trains_sub(b, t, g):
-                target = min(self.sub_target(b, t, g), self.s.reached_reward)
+                only_reaching_pays = max(self.s.wrong_subgoal_reward, self.s.hazard_reward) <= 0
+                target = self.sub_target(b, t, g)
+                target = min(target, self.s.reached_reward) if only_reaching_pays else target
                 sub[b, t, g] = self.q[b][t][g][self.action[b][t]] - target
             if self.trains_meta(b, t, g):
                 target = self.meta_target(b, t, g) if self.s.intra_option else self.option_target(b, t)
-                if self.s.max_meta_target is not None:
-                    target = min(max(target, 0.0), self.s.max_meta_target)
+                target = min(max(target, self.s.min_meta_target), self.s.max_meta_target)
                 meta[b, t, g] = self.m[b][t][g] - target
         return sub, meta
 

@@ -1,0 +1,202 @@
+"""Builders given environments that do not fit them: one message says everything that is wrong."""
+
+import pickle
+from functools import partial
+
+import gymnasium
+import pytest
+import torch
+from helpers import ALGORITHMS, build, collect, small_env
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, Unbounded
+from torchrl.envs import DTypeCastTransform, GymWrapper, ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
+from user_envs import Corridor
+
+from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.modules import Architecture, FullyConnectedFeatures, compact_network
+
+EVERY = [*ALGORITHMS, "v3"]
+N = 4
+
+
+def cart_pole(**settings):
+    return GymWrapper(gymnasium.make("CartPole-v1"), **settings)
+
+
+def refusal(name, env):
+    """What a builder says."""
+    with pytest.raises(ValueError) as raised:
+        build(name, env)
+    return str(raised.value)
+
+
+class TestActions:
+    @pytest.mark.parametrize("name", EVERY)
+    def test_one_hot_actions_are_refused_with_the_setting_that_helps(self, name):
+        message = refusal(name, Corridor(N, odd={"action": OneHot(2, shape=(N, 2))}))
+        assert "'action' must be one number of n, [4] int64 (Categorical), got [4, 2] bool (OneHot)" in message
+        assert "pass categorical_action_encoding=True to GymEnv or GymWrapper" in message
+
+    def test_gymnasium_s_own_wrapper_is_refused_with_its_default_and_only_then(self):
+        envs = [
+            SerialEnv(2, partial(cart_pole, **settings)) for settings in ({}, {"categorical_action_encoding": True})
+        ]
+        messages = [refusal("dqn", env) for env in envs]
+        assert ["categorical_action_encoding" in message for message in messages] == [True, False]
+
+    @pytest.mark.parametrize(
+        ("spec", "remedy"),
+        [
+            (MultiCategorical([2, 3], shape=(N, 2)), "give each combination of its parts one number"),
+            (MultiOneHot([2, 3], shape=(N, 5)), "give each combination of its parts one number"),
+            (Bounded(-1, 1, shape=(N, 2)), "ActionDiscretizer"),
+            (Binary(shape=(N, 3), dtype=torch.int8), "give each combination of its bits one number"),
+            (Categorical(2, shape=(N, 1)), "let it have the environment's batch size"),
+        ],
+        ids=lambda value: type(value).__name__,
+    )
+    def test_actions_of_several_parts_are_refused(self, spec, remedy):
+        assert remedy in refusal("v2", Corridor(N, odd={"action": spec}))
+
+
+class TestObservations:
+    @pytest.mark.parametrize("name", EVERY)
+    @pytest.mark.parametrize(
+        "spec",
+        [
+            Unbounded(shape=(N, 4)),
+            Bounded(0, 255, shape=(N, 3, 44, 60), dtype=torch.uint8),
+            Bounded(0, 255, shape=(N, 44, 44), dtype=torch.uint8),
+            Bounded(0, 255, shape=(N, 44, 44, 3), dtype=torch.uint8),
+            Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.int32),
+            Unbounded(shape=(N, 3, 44, 44), dtype=torch.float64),
+            Bounded(0, 255, shape=(N, 3, 20, 20), dtype=torch.uint8),
+            Categorical(5, shape=(N,), dtype=torch.int64),
+            Categorical(5, shape=(N, 3, 4), dtype=torch.uint8),
+            MultiCategorical([5, 3], shape=(N, 2)),
+        ],
+        ids=[
+            "vector",
+            "not square",
+            "no channels",
+            "HWC",
+            "int32",
+            "float64",
+            "tiny",
+            "number",
+            "3x4 cells",
+            "numbers",
+        ],
+    )
+    def test_what_the_networks_cannot_read_is_refused_before_they_are_built(self, name, spec):
+        message = refusal(name, Corridor(N, without=("success",), odd={"observation": spec}))
+        assert (
+            "'observation' must be a square of cell codes [V, V] (Categorical, integers) or a square image" in message
+        )
+        assert f"got {list(spec.shape)} {str(spec.dtype).removeprefix('torch.')} ({type(spec).__name__})" in message
+
+    @pytest.mark.parametrize(
+        "spec",
+        [
+            Categorical(5, shape=(N, 3, 3), dtype=torch.int64),
+            Bounded(0, 255, shape=(N, 1, 33, 33), dtype=torch.uint8),
+            Unbounded(shape=(N, 2, 40, 40)),
+        ],
+        ids=["int64 cells", "grey", "floats"],
+    )
+    @pytest.mark.parametrize("name", ["dqn", "v2", "v3"])
+    def test_what_they_can_read_is_learned_from(self, name, spec):
+        env = Corridor(N, odd={"observation": spec})
+        algorithm = build(name, env)
+        algorithm.observe(collect(algorithm, env, 16)[0])
+        for learner in algorithm.learners.values():
+            assert torch.isfinite(learner.update(learner.sample())["loss"])
+
+    def test_an_architecture_of_one_s_own_reads_what_it_wants(self):
+        plain = Architecture(
+            hidden_size=8,
+            observation_features=lambda spec: FullyConnectedFeatures(spec.shape[-1], (8,)),
+            vector_features=lambda size: FullyConnectedFeatures(size, (8,)),
+        )
+        env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
+        algorithm = build("v2", env, plain)
+        algorithm.observe(collect(algorithm, env, 16)[0])
+        assert torch.isfinite(algorithm.learners["sub"].update(algorithm.learners["sub"].sample())["loss"])
+
+
+class TestEntries:
+    @pytest.mark.parametrize("name", ["hdqn", "v1", "v2", "v3"])
+    def test_all_that_is_wrong_is_said_at_once_and_all_that_is_there(self, name):
+        odd = {
+            "attained": Binary(shape=(N, 2), dtype=torch.int8),
+            "hazard": Binary(shape=(N, 2), dtype=torch.bool),
+            "success": Binary(shape=(N, 1), dtype=torch.int8),
+            "reward": Unbounded(shape=(N, 1), dtype=torch.float64),
+        }
+        message = refusal(name, Corridor(N, without=("extrinsic_reward",), odd=odd))
+        for problem in (
+            "'attained' must be [4, G] bool, got [4, 2] int8 (Binary); cast it",
+            "'hazard' must be [4, 1] bool, got [4, 2] bool (Binary)",
+            "'success' must be [4, 1] bool, got [4, 1] int8 (Binary); cast it",
+            "'reward' must be [4, 1] float32, got [4, 1] float64 (Unbounded",
+            "'extrinsic_reward' must be [4, 1] float32, it is missing",
+            "'observation': [4, 1, 1] uint8 (Categorical)",
+        ):
+            assert problem in message
+
+    def test_subgoals_are_asked_of_agents_that_have_some(self):
+        env = Corridor(N, without=("attained", "extrinsic_reward", "hazard", "success"))
+        assert "'attained' must be [4, G] bool, it is missing" in refusal("v3", env)
+        for name in ("dqn", "drqn"):
+            algorithm = build(name, env)
+            algorithm.observe(collect(algorithm, env, 16)[0])
+            assert torch.isfinite(algorithm.learners["flat"].update(algorithm.learners["flat"].sample())["loss"])
+
+    @pytest.mark.parametrize(
+        ("num_envs", "remedy"), [(None, r"SerialEnv(16, make_env)"), (2, "not a batch of batches")]
+    )
+    @pytest.mark.parametrize("name", EVERY)
+    def test_a_batch_of_environments_is_needed_and_one_only(self, name, num_envs, remedy):
+        env = Corridor(None) if num_envs is None else ParallelEnv(3, lambda: small_env(num_envs))
+        assert remedy in refusal(name, env)
+
+    def test_the_remedies_help(self):
+        env = Corridor(N, odd={"attained": Binary(shape=(N, 2), dtype=torch.int8)})
+        cast = DTypeCastTransform(dtype_in=torch.int8, dtype_out=torch.bool, in_keys=["attained"])
+        build("v3", TransformedEnv(env, cast))
+        env = TransformedEnv(small_env(N), RenameTransform(["observation"], ["view"]))
+        assert "'observation' must be what the agent sees, it is missing" in refusal("dqn", env)
+        build("dqn", TransformedEnv(env, RenameTransform(["view"], ["observation"])))
+
+
+@pytest.mark.parametrize("without", [("hazard", "success"), ("hazard", "success", "truncated")], ids=str)
+@pytest.mark.parametrize("options", [{}, {"hazard_reward": 0.0}], ids=str)
+@pytest.mark.parametrize("name", [*EVERY, "hindsight"])
+def test_agents_learn_without_what_not_every_task_has(name, options, without):
+    env = Corridor(N, without=without)
+    if name == "hindsight":
+        name, options = "v2", {**options, "sub_hindsight": True, "meta_hindsight": True}
+    elif name in ("dqn", "drqn"):
+        options = {}
+    algorithm = build(name, env, **options)
+    for batch in collect(algorithm, env, 8, 2):
+        algorithm.observe(batch)
+    for learner in algorithm.learners.values():
+        assert torch.isfinite(learner.update(learner.sample())["loss"])
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_transforms_can_be_sent_to_another_process_and_hold_no_environment(name):
+    algorithm = build(name, small_env(N))
+    sent = pickle.dumps(algorithm.make_transforms)
+    assert b"hdrqn_torchrl.envs" not in sent and b"modules.q_network" not in sent
+    env = small_env(N)
+    torch.manual_seed(0)
+    expected = algorithm.transform(small_env(N)).rollout(9, algorithm.policy, break_when_any_done=False)
+    torch.manual_seed(0)
+    found = TransformedEnv(env, pickle.loads(sent)()).rollout(9, algorithm.policy, break_when_any_done=False)
+    assert (expected == found).all()
+
+
+def test_the_builders_of_v3_name_themselves():
+    with pytest.raises(ValueError, match=r"^env must have what make_v3 reads:\n"):
+        make_v3(Corridor(None), compact_network(8))

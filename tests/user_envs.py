@@ -1,0 +1,103 @@
+"""Environments such as users bring: small, and each one different from this project's own in some way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+
+from hdrqn_torchrl.envs import Task
+
+CELLS = 5
+
+
+class Corridor(EnvBase):
+    """Five cells in a row, of which the agent sees its own; the two ends are the subgoals, and it starts in the middle.
+
+    Args:
+        num_envs: number of corridors; ``None``: one, without a batch dimension.
+        num_goals: 2: how many ends there are; it bounds nothing.
+        pays: extrinsic reward for coming to an end.
+        length: steps of an episode; ``None``: it never ends.
+        without: entries that the environment does not write.
+        odd: specs that differ, by entry; what is written is drawn from them.
+        task: what it says about itself.
+        device: of all tensors.
+    """
+
+    def __init__(
+        self,
+        num_envs: int | None = 4,
+        *,
+        num_goals: int = 2,
+        pays: float = 1.0,
+        length: int | None = 6,
+        without: Sequence[str] = ("hazard", "success"),
+        odd: dict[str, TensorSpec] | None = None,
+        task: Task | None = None,
+        device: str = "cpu",
+    ) -> None:
+        batch = () if num_envs is None else (num_envs,)
+        super().__init__(device=device, batch_size=batch)
+        self.pays, self.length, self.num_goals = pays, length, num_goals
+        self.odd = odd or {}
+        if task is not None:
+            self.task = task
+        one = (*batch, 1)
+        observations = {
+            "observation": Categorical(CELLS, shape=(*batch, 1, 1), dtype=torch.uint8),
+            "attained": Binary(shape=(*batch, 2), dtype=torch.bool),
+            "hazard": Binary(shape=one, dtype=torch.bool),
+            "success": Binary(shape=one, dtype=torch.bool),
+        }
+        rewards = {key: Unbounded(shape=one) for key in ("reward", "extrinsic_reward")}
+        ends = {key: Binary(shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
+        self.observation_spec = self._composite(observations, without)
+        self.full_reward_spec = self._composite(rewards, without)
+        self.full_done_spec = self._composite(ends, without)
+        self.action_spec = self.odd.get("action", Categorical(2, shape=batch, dtype=torch.int64))
+        self._place = torch.full(batch, CELLS // 2)
+        self._steps = torch.zeros(batch, dtype=torch.int64)
+
+    def _composite(self, entries: dict[str, TensorSpec], without: Sequence[str]) -> Composite:
+        kept = {key: self.odd.get(key, spec) for key, spec in entries.items() if key not in without}
+        return Composite(kept, shape=self.batch_size)
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing is random."""
+
+    def _reset(self, tensordict, **kwargs):
+        everyone = torch.ones(self.batch_size, dtype=torch.bool)
+        reset = everyone if tensordict is None else tensordict.get("_reset", everyone).view(self.batch_size)
+        self._place = torch.where(reset, CELLS // 2, self._place)
+        self._steps = torch.where(reset, 0, self._steps)
+        return self._written(torch.zeros_like(everyone), self.observation_spec, self.full_done_spec)
+
+    def _step(self, tensordict):
+        action = tensordict.get("action")
+        move = 2 * action - 1 if action.shape == self.batch_size else torch.ones_like(self._place)
+        before, self._place = self._place, (self._place + move).clamp(0, CELLS - 1)
+        self._steps = self._steps + 1
+        return self._written(self._place != before, self.observation_spec, self.full_reward_spec, self.full_done_spec)
+
+    def _written(self, moved, *specs):
+        ends = torch.stack([self._place == 0, self._place == CELLS - 1], -1) & moved.unsqueeze(-1)
+        over = torch.zeros_like(moved) if self.length is None else self._steps >= self.length
+        pay = self.pays * ends.any(-1).float()
+        values = {
+            "observation": self._place[..., None, None].to(torch.uint8),
+            "attained": ends,
+            "hazard": torch.zeros_like(moved)[..., None],
+            "success": ends[..., -1:],
+            "reward": pay[..., None],
+            "extrinsic_reward": pay[..., None],
+            "done": over[..., None],
+            "terminated": torch.zeros_like(over)[..., None],
+            "truncated": over[..., None],
+        }
+        wanted = {key: spec for each in specs for key, spec in each.items()}
+        outcome = {key: spec.rand() if key in self.odd else values[key] for key, spec in wanted.items()}
+        return TensorDict(outcome, self.batch_size)
