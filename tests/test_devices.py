@@ -167,7 +167,7 @@ def test_what_waits_in_an_iteration_does_so_once_per_batch(name, as_on_gpu, tmp_
         found.append(sorted(wait for wait in waits.found if wait != DRAWN_BY_THE_HOST))
         trainer.collector.shutdown()
     assert found[0] == found[1]
-    expected = {"trainer.py:check_finite", "evaluation.py:finished", "learner.py:store", "finite.py:check"}
+    expected = {"trainer.py:check_finite", "evaluation.py:finished", "data/replay.py:extend", "finite.py:check"}
     starts = {"data/samplers.py:_find_starts", "data/samplers.py:episode_starts"}
     expected |= starts if name == "v3" else {"data/samplers.py:sample"}
     if name in ("hdqn", "v1", "v2"):

@@ -23,11 +23,13 @@ from hdrqn_torchrl.modules.exploration import (
     RepeatingEpsilonGreedy,
     check_chooses_subgoals,
     choose_action,
+    exploration_or_greedy,
 )
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import Gaps, lstm_weights, restarting_lstm
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.q_network import ExactLinear, State, dueling
+from hdrqn_torchrl.modules.sizes import check_size
 
 
 class AllSubgoalsNetwork(nn.Module):
@@ -41,6 +43,9 @@ class AllSubgoalsNetwork(nn.Module):
         head_size: units of the hidden layer of each level's heads.
         joint: whether the meta level, too, trains the memory; ``False``: it only reads it.
         predictor: a second task for the memory; not used in acting.
+
+    Raises:
+        ValueError: if a size is not positive.
 
     Examples:
         >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
@@ -67,8 +72,9 @@ class AllSubgoalsNetwork(nn.Module):
     ) -> None:
         super().__init__()
         for name, value in (("hidden_size", hidden_size), ("head_size", head_size)):
-            if value < 1:
-                raise ValueError(f"{name} must be >= 1, got {value}; use 128.")
+            check_size(name, value, 128)
+        check_size("num_actions", num_actions, "the number of the environment's actions")
+        check_size("num_subgoals", num_subgoals, "the number of the task's subgoals")
         self.features, self.hidden_size, self.joint = features, hidden_size, joint
         self.predictor = predictor
         self.num_actions, self.num_subgoals = num_actions, num_subgoals
@@ -166,6 +172,9 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         hidden_key, cell_key: LSTM state ``[H]``.
         repeated_action_key: random stretch in progress ``[2]``, for a :class:`RepeatingEpsilonGreedy`.
 
+    Raises:
+        ValueError: if an exploration is none, or ``meta_exploration`` repeats its choices.
+
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -200,8 +209,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.network = network
-        self.sub_exploration = sub_exploration or EpsilonGreedy(0.0, 0.0)
-        self.meta_exploration = meta_exploration or EpsilonGreedy(0.0, 0.0)
+        self.sub_exploration = exploration_or_greedy(sub_exploration, "sub_exploration")
+        self.meta_exploration = exploration_or_greedy(meta_exploration, "meta_exploration")
         check_chooses_subgoals(self.meta_exploration, "meta_exploration")
         self.sub_exploration.set_num_subgoals(network.num_subgoals)
         self.observation_key, self.previous_action_key, self.init_key = observation_key, previous_action_key, init_key

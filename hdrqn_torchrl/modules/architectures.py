@@ -19,6 +19,7 @@ from hdrqn_torchrl.modules.features import (
 )
 from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, ImageDecoder, ObservationPredictor
 from hdrqn_torchrl.modules.q_network import QNetwork
+from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +41,9 @@ class Architecture:
     vector_features: Callable[[int], Features]
     observation_problem: Callable[[TensorSpec, Sequence[int]], str | None] = lambda spec, shape: None
 
+    def __post_init__(self) -> None:
+        check_size("hidden_size", self.hidden_size, "64, or the paper's 256")
+
     def q_network(
         self,
         inputs: TensorSpec | int,
@@ -53,6 +57,7 @@ class Architecture:
 
         Its memory can learn to predict up to ``prediction_steps`` steps ahead what will be seen.
         """
+        check_size("prediction_steps", prediction_steps, "4, or 0 for no prediction", least=0)
         predictor = None
         if prediction_steps and not isinstance(inputs, int):
             predictor = observation_predictor(inputs, self.hidden_size, num_actions, prediction_steps)
@@ -98,20 +103,24 @@ def compact_network(
 
     Args:
         hidden_size: H, size of the LSTM.
-        widths: sizes of the dense layers.
+        widths: sizes of the dense layers, at least one.
         gate_features: whether the subgoal scales the features beside being appended to them.
+
+    Raises:
+        ValueError: if a size is not positive.
     """
+    sizes = check_widths(widths)
 
     def observation_features(spec: TensorSpec) -> Features:
         if is_grid(spec):
-            return CellFeatures(spec.shape[-1], spec.n, tuple(widths))
-        return ConvFeatures(spec.shape[-3], spec.shape[-1], widths[-1], channels=(16, 32, 32, 32))
+            return CellFeatures(spec.shape[-1], spec.n, sizes)
+        return ConvFeatures(spec.shape[-3], spec.shape[-1], sizes[-1], channels=(16, 32, 32, 32))
 
     return Architecture(
         hidden_size=hidden_size,
         gate_features=gate_features,
         observation_features=observation_features,
-        vector_features=lambda size: FullyConnectedFeatures(size, tuple(widths)),
+        vector_features=lambda size: FullyConnectedFeatures(size, sizes),
         observation_problem=grid_or_image,
     )
 

@@ -25,6 +25,7 @@ from hdrqn_torchrl.modules.exploration import (
     RepeatingEpsilonGreedy,
     check_chooses_subgoals,
     choose_action,
+    exploration_or_greedy,
 )
 from hdrqn_torchrl.modules.q_network import QNetwork, State
 from hdrqn_torchrl.modules.success import SuccessEpsilonGreedy
@@ -45,6 +46,9 @@ class SubController(TensorDictModuleBase):
         hidden_key, cell_key: LSTM state ``[H]``.
         repeated_action_key: random stretch in progress ``[2]``, for a
             :class:`~hdrqn_torchrl.modules.RepeatingEpsilonGreedy`.
+
+    Raises:
+        ValueError: if network or ``exploration`` do not fit a flat or hierarchical agent.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -78,7 +82,7 @@ class SubController(TensorDictModuleBase):
                 f"subgoal_key must be None exactly when the network has no condition, got subgoal_key={subgoal_key!r} "
                 f"and num_conditions={network.num_conditions}; set num_conditions to the number of subgoals."
             )
-        self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
+        self.network, self.exploration = network, exploration_or_greedy(exploration, "exploration")
         if subgoal_key is not None:
             self.exploration.set_num_subgoals(network.num_conditions)
         elif isinstance(exploration, SuccessEpsilonGreedy):
@@ -161,6 +165,9 @@ class MetaController(TensorDictModuleBase):
         action_value_key: Q-values, written in learning.
         hidden_key, cell_key: LSTM state ``[H]``.
 
+    Raises:
+        ValueError: if ``network`` has a condition, nothing is read, or ``exploration`` repeats its choices.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> from hdrqn_torchrl.modules import FullyConnectedFeatures
@@ -188,7 +195,16 @@ class MetaController(TensorDictModuleBase):
         cell_key: NestedKey = keys.META_CELL,
     ) -> None:
         super().__init__()
-        self.network, self.exploration = network, exploration or EpsilonGreedy(0.0, 0.0)
+        if not input_keys or isinstance(input_keys, str):
+            raise ValueError(
+                f"input_keys must be a list of at least one entry, got {input_keys!r}; v1 reads ['observation']."
+            )
+        if network.num_conditions:
+            raise ValueError(
+                f"network must have no condition, got num_conditions={network.num_conditions}; a meta-controller "
+                "chooses the subgoal and is given none."
+            )
+        self.network, self.exploration = network, exploration_or_greedy(exploration, "exploration")
         check_chooses_subgoals(self.exploration, "exploration")
         self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
         self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
@@ -235,6 +251,9 @@ class HierarchicalPolicy(TensorDictModuleBase):
             which the last one ended, so that v2's meta-controller reads it, too. ``False`` is Algorithm 1 as
             written: the state after the last decision.
         init_key: first step of an episode ``[1]`` bool; read if ``read_last_observation``.
+
+    Raises:
+        ValueError: if the two do not fit each other, or there is no state to advance.
     """
 
     def __init__(
@@ -246,6 +265,14 @@ class HierarchicalPolicy(TensorDictModuleBase):
         init_key: NestedKey = keys.IS_INIT,
     ) -> None:
         super().__init__()
+        chosen, known = meta_controller.network.num_actions, sub_controller.network.num_conditions
+        if chosen != known:
+            raise ValueError(
+                f"sub_controller must have as many conditions as the meta_controller has subgoals, got {known} and "
+                f"{chosen}; build its network with num_conditions={chosen}."
+            )
+        if read_last_observation and not sub_controller.network.recurrent:
+            raise ValueError("read_last_observation must be False without recurrence: the sub_controller has no state.")
         self.meta_controller, self.sub_controller = meta_controller, sub_controller
         self.read_last_observation, self.init_key = read_last_observation, init_key
         made = [key for key in meta_controller.out_keys if key in sub_controller.in_keys]

@@ -8,6 +8,8 @@ from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from hdrqn_torchrl.modules.sizes import check_size
+
 
 class EpsilonGreedy(nn.Module):
     """Chooses the best action, or with probability epsilon a uniformly random one.
@@ -22,6 +24,7 @@ class EpsilonGreedy(nn.Module):
         end: epsilon from ``anneal_frames`` on.
         anneal_frames: length of the schedule in environment frames.
         ladder: spread of epsilon over the environments, epsilon to the power of 1 to 1 + ladder; 0: all have the same.
+            A single environment has the first rung; of several worker processes each has all of them.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -45,10 +48,11 @@ class EpsilonGreedy(nn.Module):
         for name, value in (("start", start), ("end", end)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be an epsilon in [0, 1], got {value}; the paper goes from 1.0 to 0.1.")
-        if anneal_frames < 1:
-            raise ValueError(f"anneal_frames must be >= 1, got {anneal_frames}; use start == end for a constant.")
-        if ladder < 0.0:
-            raise ValueError(f"ladder must be >= 0, got {ladder}; 0 gives every environment the same epsilon.")
+        check_size("anneal_frames", anneal_frames, "start == end for a constant")
+        if not 0.0 <= ladder < float("inf"):
+            raise ValueError(
+                f"ladder must be >= 0 and finite, got {ladder}; 0 gives all environments the same epsilon."
+            )
         self.start, self.end, self.anneal_frames, self.ladder = start, end, anneal_frames, ladder
         self.register_buffer("frames", torch.zeros((), dtype=torch.int64))
         self.register_buffer("epsilon", torch.tensor(float(start)))
@@ -124,6 +128,9 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         exponent: :math:`\mu`.
         max_repeats: longest stretch.
 
+    Raises:
+        ValueError: if an argument breaks its rule.
+
     Examples:
         >>> exploration = RepeatingEpsilonGreedy(1.0, 1.0, max_repeats=1)
         >>> choice, carried = exploration.extend(torch.zeros(3, 4), torch.zeros(3, 2, dtype=torch.int64))
@@ -144,10 +151,9 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         max_repeats: int = 15,
     ) -> None:
         super().__init__(start, end, anneal_frames=anneal_frames, ladder=ladder)
-        if exponent <= 0:
-            raise ValueError(f"exponent must be > 0, got {exponent}; Dabney et al. use 2.")
-        if max_repeats < 1:
-            raise ValueError(f"max_repeats must be >= 1 step, got {max_repeats}; use 15.")
+        if not 0.0 < exponent < float("inf"):
+            raise ValueError(f"exponent must be > 0 and finite, got {exponent}; Dabney et al. use 2.")
+        check_size("max_repeats", max_repeats, 15)
         durations = torch.arange(1, max_repeats + 1, dtype=torch.float32) ** -exponent
         self.register_buffer("_durations", durations / durations.sum(), persistent=False)
         self._mean_duration = (torch.arange(1, max_repeats + 1) * self._durations).sum().item()
@@ -208,6 +214,19 @@ def choose_action(
     action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key), subgoal, starts)
     tensordict.set(unravel_key(("next", repeated_action_key)), carried)
     return action
+
+
+def exploration_or_greedy(exploration: EpsilonGreedy | None, name: str) -> EpsilonGreedy:
+    """What an argument called ``name`` means: ``None`` is always greedy.
+
+    Raises:
+        ValueError: if it is something else.
+    """
+    if exploration is None:
+        return EpsilonGreedy(0.0, 0.0)
+    if not isinstance(exploration, EpsilonGreedy):
+        raise ValueError(f"{name} must be an EpsilonGreedy or None, got {exploration!r}; None is always greedy.")
+    return exploration
 
 
 def check_chooses_subgoals(exploration: EpsilonGreedy, name: str) -> None:

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.cells import nearest_cell, palette
+from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
 _USUAL_VIEW = 5
 SMALLEST_IMAGE = 33
@@ -45,6 +46,8 @@ class CellsToImage(nn.Module):
 
     def __init__(self, view: int, num_codes: int, size: int = 44) -> None:
         super().__init__()
+        _check_grid(view, num_codes)
+        check_size("size", size, 44)
         self.register_buffer("_cells", nearest_cell(size, view), persistent=False)  # of each row, of each column
         self.register_buffer("_colours", palette(num_codes).float() / 255, persistent=False)
 
@@ -79,16 +82,18 @@ class ConvFeatures(Features):
         channels: tuple[int, int, int, int] = (32, 64, 64, 64),
     ) -> None:
         super().__init__()
+        check_size("in_channels", in_channels, "3 for colour images, 1 for grey ones")
+        check_size("size", size, "44, as the paper does", least=SMALLEST_IMAGE)
+        check_size("out_features", out_features, 256)
+        check_widths(channels, "channels")
+        if len(channels) != 4:
+            raise ValueError(f"channels must be four sizes, got {len(channels)}; the paper has (32, 64, 64, 64).")
         kernels_and_strides = ((5, 2), (3, 2), (3, 2), (3, 1))
         layers: list[nn.Module] = []
         previous, side = in_channels, size
         for width, (kernel, stride) in zip(channels, kernels_and_strides, strict=True):
             layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU(inplace=True)]
             previous, side = width, (side - kernel) // stride + 1
-        if side < 1:
-            raise ValueError(
-                f"size must be >= {SMALLEST_IMAGE} pixels for four convolutions, got {size}; the paper uses 44."
-            )
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # as oneDNN and cuDNN like it
         self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU(inplace=True))
         self.out_features = out_features
@@ -128,6 +133,7 @@ class CellFeatures(Features):
 
     def __init__(self, view: int, num_codes: int, widths: tuple[int, ...] = (128,)) -> None:
         super().__init__()
+        _check_grid(view, num_codes)
         scale = min(1.0, (_USUAL_VIEW / view) ** 2)
         self.register_buffer("_one_hot", torch.eye(num_codes) * scale, persistent=False)
         self.dense = _dense_layers(view * view * num_codes, widths)
@@ -153,6 +159,7 @@ class FullyConnectedFeatures(Features):
 
     def __init__(self, in_features: int, widths: tuple[int, ...] = (256, 256, 256, 256)) -> None:
         super().__init__()
+        check_size("in_features", in_features, "the size of the vector")
         self.dense = _dense_layers(in_features, widths)
         self.out_features = widths[-1]
 
@@ -171,9 +178,14 @@ class ChainedFeatures(Features):
         return self.features(self.first(observation))
 
 
+def _check_grid(view: int, num_codes: int) -> None:
+    check_size("view", view, 5)
+    check_size("num_codes", num_codes, "the number of different cells")
+
+
 def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for width in widths:
+    for width in check_widths(widths):
         layers += [nn.Linear(in_features, width), nn.ReLU(inplace=True)]
         in_features = width
     return nn.Sequential(*layers)

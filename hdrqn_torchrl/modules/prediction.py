@@ -14,6 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hdrqn_torchrl.modules.sizes import check_size
+
 
 class Decoder(nn.Module):
     """Turns a vector into a guess of an observation, and tells how wrong it was."""
@@ -45,6 +47,8 @@ class CellDecoder(Decoder):
 
     def __init__(self, in_features: int, view: int, num_codes: int) -> None:
         super().__init__()
+        for name, value, usual in (("in_features", in_features, 128), ("view", view, 5), ("num_codes", num_codes, 5)):
+            check_size(name, value, usual)
         self.logits = nn.Linear(in_features, view * view * num_codes)
         self.num_codes = num_codes
 
@@ -71,6 +75,8 @@ class ImageDecoder(Decoder):
 
     def __init__(self, in_features: int, channels: int, size: int = 14) -> None:
         super().__init__()
+        for name, value, usual in (("in_features", in_features, 128), ("channels", channels, 3), ("size", size, 14)):
+            check_size(name, value, usual)
         self.pixels = nn.Linear(in_features, channels * size * size)
         self.size = size
 
@@ -108,9 +114,13 @@ class ObservationPredictor(nn.Module):
         self, make_decoder: DecoderFactory, *, hidden_size: int, num_actions: int, max_steps: int = 4, width: int = 128
     ) -> None:
         super().__init__()
-        for name, value, usual in (("max_steps", max_steps, 4), ("width", width, 128)):
-            if value < 1:
-                raise ValueError(f"{name} must be >= 1, got {value}; use {usual}.")
+        for name, value, usual in (
+            ("max_steps", max_steps, 4),
+            ("width", width, 128),
+            ("hidden_size", hidden_size, 128),
+        ):
+            check_size(name, value, usual)
+        check_size("num_actions", num_actions, "the number of the environment's actions")
         self.max_steps, self.num_actions = max_steps, num_actions
         self.memory = nn.Linear(hidden_size, width)
         self.actions = nn.Embedding(max_steps * num_actions, width)  # by place in the sequence of actions

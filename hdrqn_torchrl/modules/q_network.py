@@ -10,6 +10,7 @@ from hdrqn_torchrl.devices import autocast_dtype, on_host
 from hdrqn_torchrl.modules.features import Features
 from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
+from hdrqn_torchrl.modules.sizes import check_size
 
 State = tuple[Tensor, Tensor]
 
@@ -58,6 +59,9 @@ class QNetwork(nn.Module):
         recurrent: ``False`` replaces the LSTM by a dense layer with ReLU.
         predictor: a second task for the memory; not used in acting.
 
+    Raises:
+        ValueError: if a size breaks its rule, or there is a predictor without a memory.
+
     Examples:
         >>> from hdrqn_torchrl.modules.features import FullyConnectedFeatures
         >>> network = QNetwork(FullyConnectedFeatures(6, (8,)), num_actions=4, hidden_size=16, num_conditions=2)
@@ -83,8 +87,9 @@ class QNetwork(nn.Module):
         super().__init__()
         if predictor is not None and not recurrent:
             raise ValueError("predictor must be None with recurrent=False: there is no memory to teach.")
-        if hidden_size < 1:
-            raise ValueError(f"hidden_size must be >= 1, got {hidden_size}; the paper uses 256.")
+        check_size("hidden_size", hidden_size, "256, as the paper does")
+        check_size("num_actions", num_actions, "the number of the environment's actions, or of its subgoals")
+        check_size("num_conditions", num_conditions, "the number of subgoals, or 0 for none", least=0)
         self.features, self.hidden_size, self.recurrent = features, hidden_size, recurrent
         self.num_actions, self.num_conditions = num_actions, num_conditions
         self.predictor = predictor

@@ -9,6 +9,7 @@ from torch.nn.functional import one_hot
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules.exploration import RepeatingEpsilonGreedy
+from hdrqn_torchrl.modules.sizes import check_size
 
 
 class SubgoalSuccess(nn.Module):
@@ -49,8 +50,7 @@ class SubgoalSuccess(nn.Module):
     ) -> None:
         super().__init__()
         for name, value, usual in (("num_subgoals", num_subgoals, 6), ("window", window, 100)):
-            if value < 1:
-                raise ValueError(f"{name} must be >= 1, got {value}; for example {usual}.")
+            check_size(name, value, usual)
         self.window = window
         self._keys = [("next", key) for key in (active_subgoal_key, option_done_key, reached_key)]
         self.register_buffer("rates", torch.zeros(num_subgoals))
@@ -81,6 +81,9 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
             counts.
         window: of :class:`SubgoalSuccess`.
 
+    Raises:
+        ValueError: if an argument breaks its rule.
+
     Examples:
         >>> exploration = SuccessEpsilonGreedy(1.0, 0.1)
         >>> exploration.set_num_subgoals(2)
@@ -105,6 +108,7 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
         super().__init__(
             start, end, anneal_frames=anneal_frames, ladder=ladder, exponent=exponent, max_repeats=max_repeats
         )
+        check_size("window", window, 100)
         self.window = window
 
     def set_num_subgoals(self, num_subgoals: int) -> None:

@@ -123,7 +123,7 @@ class TestLadder:
         assert (choices != 0).float().mean(1).tolist() == pytest.approx([0.495, 0.2475], abs=0.02)
 
     def test_a_negative_one(self):
-        with pytest.raises(ValueError, match=r"ladder must be >= 0, got -1\.0; "):
+        with pytest.raises(ValueError, match=r"ladder must be >= 0 and finite, got -1\.0; "):
             EpsilonGreedy(ladder=-1.0)
 
 
@@ -219,8 +219,8 @@ class TestRepeatingEpsilonGreedy:
         ("arguments", "message"),
         [
             ({"start": 2.0}, r"start must be an epsilon in \[0, 1\], got 2.0; "),
-            ({"exponent": 0.0}, "exponent must be > 0, got 0.0; "),
-            ({"max_repeats": 0}, "max_repeats must be >= 1 step, got 0; "),
+            ({"exponent": 0.0}, "exponent must be > 0 and finite, got 0.0; "),
+            ({"max_repeats": 0}, "max_repeats must be >= 1, got 0; "),
         ],
     )
     def test_wrong_values(self, arguments, message):

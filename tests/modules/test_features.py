@@ -52,7 +52,7 @@ class TestConvFeatures:
         assert ConvFeatures(1, size, 5, channels=(2, 2, 2, 2))(torch.zeros(1, 1, size, size)).shape == (1, 5)
 
     def test_an_image_that_is_too_small(self):
-        with pytest.raises(ValueError, match=r"size must be >= 33 pixels.*got 32; "):
+        with pytest.raises(ValueError, match=r"size must be >= 33, got 32; "):
             ConvFeatures(size=32)
 
 
