@@ -282,7 +282,7 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
         for result in sorted(results, key=lambda each: (each["env"]["sticky"], each["epsilon"])):
             key = result["per_subgoal"][list(result["env"]["subgoals"]).index("key")]["attained"]
             interval = result["intervals"]["return_mean"]
-            reach = f"{interval[0]:.0f} to {interval[1]:.0f}" if interval else ""
+            reach = f"{interval[0]:.0f} to {interval[1]:.0f}" if interval and interval[0] < interval[1] else ""
             cells = (
                 *(label, value_of(member.entry, "seed"), f"{run.metrics['frames'][-1] / 1000:.0f}k"),
                 *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),
