@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.finite import FiniteGuard
-from hdrqn_torchrl.objectives import check_returns
+from hdrqn_torchrl.objectives import check_returns, target_lookahead
 from hdrqn_torchrl.precision import Precision, choose_precision, matrix_products
 
 
@@ -42,7 +42,8 @@ class LearnerSettings:
     :mod:`hdrqn_torchrl.algorithms` pass them on.
 
     Args:
-        slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level).
+        slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level). What its
+            targets need beyond them is drawn, too (:meth:`lookahead`).
         batch_size: sequences of a minibatch.
         capacity: transitions kept in the replay memory.
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
@@ -53,7 +54,7 @@ class LearnerSettings:
         tau: rate of the soft target update.
         max_grad_norm: gradients are clipped to this norm; ``None``: not at all.
         burn_in: share of a sequence left out of the loss at its beginning; its steps only bring the recurrent state up
-            to date. (Gradients flow back through it: what is remembered there is learned, too.)
+            to date. (Gradients flow back through it: what is remembered there is learned, too.) None without memory.
         train_exact_states: train leading steps whose recurrent state is exact (see
             :func:`~hdrqn_torchrl.objectives.training_mask`).
         stored_state: store the recurrent state that acting had at each step, and let sequences that begin in
@@ -135,12 +136,6 @@ class LearnerSettings:
             ("importance_exponent", 0 <= self.importance_exponent <= 1, "in [0, 1]", "use 0.6"),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
             (
-                "n_step",
-                self.n_step <= self.slice_len,
-                "<= slice_len",
-                "no sequence holds so many rewards; raise slice_len",
-            ),
-            (
                 "slice_len",
                 not self.trace_decay or self.slice_len > 1,
                 "> 1 where trace_decay > 0",
@@ -151,6 +146,17 @@ class LearnerSettings:
             if not holds:
                 raise ValueError(f"{name} must be {rule}, got {getattr(self, name)}; {remedy}.")
 
+    def lookahead(self, trace_decay: float | None = None) -> int:
+        """Transitions that are drawn beyond ``slice_len``, so that targets are not cut short.
+
+        Sequences from the start of an episode are meant to cover it, and have none for Q(lambda).
+
+        Args:
+            trace_decay: lambda; ``None``: that of these settings.
+        """
+        decay = self.trace_decay if trace_decay is None else trace_decay
+        return target_lookahead(0.0 if self.sampling in FROM_STARTS else decay, self.n_step, self.slice_len)
+
 
 class Learner:
     """Stores what was collected, samples sequences, and updates one network from them.
@@ -160,9 +166,9 @@ class Learner:
         settings: how it learns.
         extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet; with
             ``state_dict`` and ``load_state_dict``.
-        loss: reads a minibatch ``[batch_size, slice_len + lookahead]``, writes ``"loss"``, which is minimised, and
+        loss: reads a minibatch ``[batch_size, slice_len + lookahead]``, with the steps of its attribute ``lookahead``
+            that it does not train (none if it has no such attribute); writes ``"loss"``, which is minimised, and
             scalars to report.
-        lookahead: steps that a minibatch's sequences have beyond ``slice_len``.
         num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
         episode_len: largest number of transitions of an episode, if known (see
             :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
@@ -184,7 +190,6 @@ class Learner:
         *,
         extract: Extract,
         loss: LossModule,
-        lookahead: int = 0,
         num_envs: int | None = None,
         episode_len: int | None = None,
         refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
@@ -207,10 +212,12 @@ class Learner:
             [{"params": parameters} for _, parameters in groups], lr=settings.learning_rate, fused=True
         )
         self._set_learning_rate()
+        lookahead = getattr(loss, "lookahead", 0)
         self._sequence_len = settings.slice_len + lookahead
         self.buffer = make_sequence_buffer(
             settings.capacity,
-            slice_len=self._sequence_len,
+            slice_len=settings.slice_len,
+            lookahead=lookahead,
             batch_size=settings.batch_size * samples_per_draw,
             num_envs=num_envs,
             episode_len=episode_len,
@@ -283,7 +290,7 @@ class Learner:
         return owed if owed > 0 and self._can_draw() else 0
 
     def sample(self) -> TensorDictBase:
-        """One minibatch of sequences ``[batch_size, slice_len]``."""
+        """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
         if not self._drawn:
             sequences = sample_sequences(self.buffer, self._sequence_len)
             self._drawn = list(sequences.split(self.settings.batch_size, 0))

@@ -114,6 +114,11 @@ def value_everything_at(learner, value):
         streams["bias"][0] = value
 
 
+def learner_ends(learner):
+    keys = learner.loss.tensor_keys
+    return keys.done, keys.terminated
+
+
 class TestBoundsOfTargets:
     """Only what the task states bounds what its agents hope for."""
 
@@ -193,8 +198,23 @@ class TestOptions:
         for level, learner in algorithm.learners.items():
             learner.store(batch)
             sample = learner.sample()
-            changed, usual = learner.loss(sample), default.learners[level].loss(sample)
-            assert changed["q_value"] == usual["q_value"] and changed["target"] != usual["target"]
+            assert sample.shape[1] == 4 + 1  # one step for the target of the last one that is trained
+            changed, usual = learner.loss(sample), default.learners[level].loss(sample[:, :4])
+            torch.testing.assert_close(changed["q_value"], usual["q_value"])  # the same steps are trained
+            assert changed["target"] != usual["target"]
+
+    @pytest.mark.parametrize(("name", "burns"), [("dqn", False), ("hdqn", False), ("drqn", True), ("v1", True)])
+    def test_only_what_has_a_memory_burns_in(self, name, burns):
+        """Without one, all steps of a sequence are trained that have a target."""
+        algorithm, batch = self.steps(name=name, settings=tiny_settings(batch_size=256))
+        for learner in algorithm.learners.values():
+            learner.store(batch)
+            sample = learner.sample()
+            real = sample.get(("collector", "mask"), torch.ones(sample.shape, dtype=torch.bool))
+            done, ended = (sample["next", key].squeeze(-1) for key in learner_ends(learner))
+            cut = (done & ~ended)[:, :-1] & real[:, 1:]
+            everything = real.sum() - cut.sum()
+            assert (learner.loss(sample)["trained_steps"] < everything) == burns
 
     @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
     def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):

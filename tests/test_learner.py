@@ -13,7 +13,9 @@ from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
 
 
-def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, separate=None, episode_len=None, **settings):
+def make_learner(
+    *, extract=None, num_envs=2, samples_per_draw=8, separate=None, episode_len=None, gamma=0.99, **settings
+):
     torch.manual_seed(0)
     network = QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=2, hidden_size=6)
     controller = SubController(network, subgoal_key=None, init_key="is_init")
@@ -23,7 +25,7 @@ def make_learner(*, extract=None, num_envs=2, samples_per_draw=8, separate=None,
         controller,
         settings,
         extract=keep,
-        loss=make_recurrent_loss(controller, settings),
+        loss=make_recurrent_loss(controller, settings, gamma=gamma),
         num_envs=num_envs,
         episode_len=episode_len,
         samples_per_draw=samples_per_draw,
@@ -198,6 +200,68 @@ class TestUpdate:
         sub.store(batch)
         sub.update(sub.sample())
         assert parameter_distance(before, meta.loss.value_network_params.data) == 0
+
+
+class TestLongerTargets:
+    """Rewards are 1 and a network of zeros adds nothing, so a target is the number of rewards that it holds."""
+
+    def rewards_held(self, *, sampling="steps", episode=60, num_batches=2, **settings):
+        """Of each trained step: rewards of its target, and stored steps of its episode from there on."""
+        learner = make_learner(num_envs=4, sampling=sampling, gamma=1.0, batch_size=64, **settings)
+        steps = make_batch(num_envs=4, time=120)
+        steps["is_init"] = (torch.arange(120) % episode == 0).expand(4, 120).unsqueeze(-1).clone()
+        done = (torch.arange(120) % episode == episode - 1).expand(4, 120).unsqueeze(-1).clone()
+        steps["next"].update({"done": done, "terminated": done.clone(), "reward": torch.ones(4, 120, 1)})
+        steps["collector", "traj_ids"] = torch.arange(120) // episode + 100 * torch.arange(4)[:, None]
+        left = episode - torch.arange(120) % episode
+        steps["left"] = left.expand(4, 120).clone()
+        learner.store(steps)
+        with torch.no_grad():
+            for parameters in (learner.loss.value_network_params, learner.loss.target_value_network_params):
+                parameters.data.zero_()
+        found = []
+        for _ in range(num_batches):
+            sample = learner.sample()
+            for row in sample.split(1):
+                result = learner.loss(row)
+                if count := int(result["trained_steps"]):
+                    found.append((result["target"].item() * count, count, row))
+        return learner, found
+
+    @pytest.mark.parametrize("sampling", ["steps", "episodes", "whole_episodes", "episode_starts"])
+    @pytest.mark.parametrize(("n_step", "slice_len"), [(5, 8), (3, 1)])
+    def test_every_target_holds_all_its_rewards(self, n_step, slice_len, sampling):
+        learner, found = self.rewards_held(n_step=n_step, slice_len=slice_len, sampling=sampling)
+        assert learner.sample().shape == (64, slice_len + n_step - 1) and len(found) > 80
+        burn_in = slice_len // 2
+        for held, count, row in found:
+            first = 0 if row["is_init"][0, 0] or slice_len == 1 else burn_in
+            left = row["left"][0, first : first + count]
+            if not row["is_init"][0, 1:].any():
+                assert held == left.clamp(max=n_step).sum() and count <= slice_len
+
+    @pytest.mark.parametrize("sampling", ["steps", "episodes"])
+    def test_the_last_steps_of_an_episode_are_trained_as_well(self, sampling):
+        _, found = self.rewards_held(n_step=5, slice_len=4, sampling=sampling, episode=20, num_batches=4)
+        trained = torch.zeros(21)
+        for _, count, row in found:
+            first = 0 if row["is_init"][0, 0] else 2
+            for left in row["left"][0, first : first + count].tolist():
+                trained[left] += 1
+        assert (trained[1:] > 0).all()
+
+    def test_a_trace_reaches_beyond_the_sequence_too(self):
+        learner, found = self.rewards_held(trace_decay=0.8, slice_len=8)
+        assert learner.sample().shape == (64, 12)
+        inner = [held / count for held, count, row in found if row["left"].min() > 1 and not row["is_init"].any()]
+        weights = torch.tensor([0.8**step for step in range(8)])
+        # All actions are greedy or none is, as values are equal; of the greedy ones each target holds 5 rewards or more
+        assert max(inner) >= weights[:5].sum() and learner.settings.lookahead() == 4
+
+    def test_sequences_from_the_start_of_an_episode_have_none_for_a_trace(self):
+        for sampling in ("episode_starts", "whole_episodes"):
+            assert tiny_settings(trace_decay=0.8, sampling=sampling).lookahead() == 0
+            assert tiny_settings(n_step=3, sampling=sampling).lookahead() == 2
 
 
 class TestPriorities:
@@ -400,7 +464,6 @@ class TestSettings:
             ({"trace_decay": -0.1}, r"trace_decay must lie in \[0, 1\], got -0.1; "),
             ({"n_step": 0}, "n_step must be >= 1, got 0; "),
             ({"n_step": 3, "trace_decay": 0.5}, "n_step must be 1 where trace_decay > 0, got n_step=3 and .*=0.5; "),
-            ({"n_step": 5}, "n_step must be <= slice_len, got 5; no sequence holds so many rewards"),
             ({"trace_decay": 0.5, "slice_len": 1}, "slice_len must be > 1 where trace_decay > 0, got 1; "),
         ],
     )

@@ -101,6 +101,7 @@ def make_recurrent_loss(
         max_target=largest_return if settings.max_target is None else settings.max_target,
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
+        lookahead=settings.lookahead(),
         state_keys=stored_states(network, settings),
         predictor=network.network.predictor,
         prediction_weight=prediction_weight,

@@ -147,6 +147,7 @@ def make_v3(
         prediction_weight=prediction_weight,
         burn_in=learner.burn_in,
         train_exact_states=learner.train_exact_states,
+        lookahead=1 + learner.lookahead(trace_decay),
         loss_function=learner.loss_function,
         stored_state=learner.stored_state,
     )
@@ -167,7 +168,6 @@ def make_v3(
         learner,
         extract=stored,
         loss=loss,
-        lookahead=1,
         num_envs=has.num_envs,
         separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
     )

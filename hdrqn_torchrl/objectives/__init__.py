@@ -11,6 +11,7 @@ from hdrqn_torchrl.objectives.targets import (
     n_step_returns,
     sequence_priority,
     smdp_target,
+    target_lookahead,
     training_mask,
     watkins_trace,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "n_step_returns",
     "sequence_priority",
     "smdp_target",
+    "target_lookahead",
     "training_mask",
     "watkins_trace",
 ]

@@ -53,7 +53,7 @@ from hdrqn_torchrl.transforms import largest_intrinsic_return
 
 
 class AllSubgoalsLoss(LossModule):
-    """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + 1]`` of consecutive steps.
+    """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + lookahead]`` of steps.
 
     The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
     on through ends of episodes; each should begin where an episode does, because the memory starts empty, unless it
@@ -78,6 +78,8 @@ class AllSubgoalsLoss(LossModule):
             level's targets are kept between them.
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
             in sequences that begin where an episode does, every state is exact.
+        lookahead: steps at the end of each sequence that are not trained: the last one, and before it those that are
+            there for the targets of others (:func:`~hdrqn_torchrl.objectives.target_lookahead`).
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
         stored_state: sequences start from the LSTM state that acting had at their first step, in both networks, and
             from zero where an episode starts.
@@ -139,6 +141,7 @@ class AllSubgoalsLoss(LossModule):
         min_meta_target: float = -math.inf,
         burn_in: float = 0.0,
         train_exact_states: bool = True,
+        lookahead: int = 1,
         loss_function: Literal["l2", "smooth_l1"] = "l2",
         stored_state: bool = False,
         prediction_weight: float = 0.1,
@@ -152,6 +155,8 @@ class AllSubgoalsLoss(LossModule):
             raise ValueError(f"burn_in must lie in [0, 1), got {burn_in}; use 0 for sequences from an episode's start.")
         if loss_function not in ("l2", "smooth_l1"):
             raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the default is 'l2'.")
+        if lookahead < 1:
+            raise ValueError(f"lookahead must be >= 1 step, got {lookahead}; the last one is never trained.")
         super().__init__()
         self.convert_to_functional(policy, "policy", create_target_params=True)
         # As in RecurrentDQNLoss: the modules as they are called, outside the module tree.
@@ -167,6 +172,7 @@ class AllSubgoalsLoss(LossModule):
             reached_reward=reached_reward, hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
         )
         self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
+        self.lookahead = lookahead
         self.state_keys = list(policy.state_keys) if stored_state else []
         self.prediction_weight = prediction_weight
         if self._predicts:
@@ -326,7 +332,7 @@ class AllSubgoalsLoss(LossModule):
         """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
         k, policy, steps = self.tensor_keys, self._policies[0], tensordict[:, :-1]
         init = steps[policy.init_key].squeeze(-1)
-        warm = training_mask(valid, init, self.burn_in, self.train_exact_states)  # [B, T]
+        warm = training_mask(valid, init, self.burn_in, self.train_exact_states, self.lookahead - 1)  # [B, T]
         left = steps[policy.mask_key] & warm.unsqueeze(-1)
         pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
         sub_steps = left & (~events["unseen"] | events["attained"])

@@ -50,7 +50,7 @@ class RecurrentDQNLoss(LossModule):
     - Where a segment ends inside a sequence without being terminated (an option's time limit), the input that
       follows belongs to the next segment; such a step is left out unless it is the last one of its sequence.
     - Longer targets (``trace_decay``, ``n_step``) go on as long as the sequence and its segment do; behind that, the
-      value stands in. Steps that are left out of the loss lend nothing to others.
+      value stands in. Steps that are left out of the loss lend nothing to others; those of the ``lookahead`` do.
 
     Args:
         value_network: in recurrent mode reads its ``in_keys`` ``[B, T + 1, ...]`` and writes ``action_value``
@@ -59,7 +59,8 @@ class RecurrentDQNLoss(LossModule):
 
     Keyword Args:
         gamma: discount of one environment step.
-        burn_in: share of each sequence left out of the loss at its beginning; the paper's last-half rule is 0.5.
+        burn_in: share of each sequence left out of the loss at its beginning; the paper's last-half rule is 0.5. A
+            network without memory has no state to bring up to date: there it is 0.
         train_exact_states: train leading steps, too, whose recurrent state is exact.
         double: choose the next action by the main network (Double DQN) instead of the target network.
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
@@ -71,6 +72,8 @@ class RecurrentDQNLoss(LossModule):
             the next action is the main network's greedy one. 0 is the one-step target.
         n_step: rewards before the value; 1 is the one-step target. Later actions are taken as they came, exploratory
             or not, as in Rainbow (Hessel et al., 2018) and R2D2: some bias for faster news.
+        lookahead: steps at the end of each sequence that are there for the targets of those before and are not trained
+            themselves (:func:`~hdrqn_torchrl.objectives.target_lookahead`); ``burn_in`` is a share of the others.
         state_keys: recurrent states that acting had, stored with the steps: sequences start from them, in both
             networks (Kapturowski et al., 2019), and from zero where ``init`` is set. None: all start from zero.
         delay_value: whether a target network is kept (update it with TorchRL's ``SoftUpdate`` or ``HardUpdate``).
@@ -137,6 +140,7 @@ class RecurrentDQNLoss(LossModule):
         prediction_weight: float = 0.1,
         trace_decay: float = 0.0,
         n_step: int = 1,
+        lookahead: int = 0,
         state_keys: Sequence[NestedKey] = (),
         delay_value: bool = True,
     ) -> None:
@@ -147,6 +151,8 @@ class RecurrentDQNLoss(LossModule):
         if loss_function not in ("l2", "smooth_l1"):
             raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the paper uses 'l2'.")
         check_returns(trace_decay, n_step)
+        if lookahead < 0:
+            raise ValueError(f"lookahead must be >= 0 steps, got {lookahead}; use target_lookahead().")
         if unknown := {unravel_key(key) for key in state_keys} - {unravel_key(key) for key in value_network.in_keys}:
             raise ValueError(
                 f"state_keys must be recurrent states that the network reads, got {sorted(map(str, unknown))}; a "
@@ -162,7 +168,8 @@ class RecurrentDQNLoss(LossModule):
             self._modules["target_value_network_params"].to_module(target, preserve_module_state=False)
         self.__dict__["_networks"] = (value_network, target)
         self.register_buffer("gamma", torch.tensor(gamma))
-        self.burn_in, self.train_exact_states = burn_in, train_exact_states
+        self.burn_in, self.train_exact_states = burn_in if self._written_states else 0.0, train_exact_states
+        self.lookahead = lookahead
         self.double, self.loss_function, self.max_target = double, loss_function, max_target
         self.trace_decay, self.n_step = trace_decay, n_step
         self.__dict__["_predictor"] = predictor  # its parameters are the network's
@@ -175,11 +182,16 @@ class RecurrentDQNLoss(LossModule):
         """The keys are read at every call; nothing to pass on."""
 
     @property
+    def _written_states(self) -> set[NestedKey]:
+        """The network's recurrent states; a network without memory has none."""
+        out_keys = self._networks[0].out_keys
+        return {unravel_key(key[1:]) for key in out_keys if isinstance(key, tuple) and key[0] == "next"}
+
+    @property
     def _input_keys(self) -> list[NestedKey]:
         """What the network reads, without its recurrent states, the restart flag and the action mask."""
         network = self._networks[0]
-        states = [key[1:] for key in network.out_keys if isinstance(key, tuple) and key[0] == "next"]
-        left_out = {unravel_key(key) for key in states} | {self.tensor_keys.init, self.tensor_keys.action_mask}
+        left_out = self._written_states | {self.tensor_keys.init, self.tensor_keys.action_mask}
         return [key for key in network.in_keys if unravel_key(key) not in left_out]
 
     @property
@@ -227,7 +239,7 @@ class RecurrentDQNLoss(LossModule):
                 )
             if self.max_target is not None:
                 wanted = wanted.clamp(max=self.max_target)
-            trained = usable & training_mask(valid, init, self.burn_in, self.train_exact_states)
+            trained = usable & training_mask(valid, init, self.burn_in, self.train_exact_states, self.lookahead)
             count = trained.sum().clamp(min=1)
             wanted = torch.where(trained, wanted, chosen)
         distance = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0)

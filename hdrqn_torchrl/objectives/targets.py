@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -110,6 +112,28 @@ def check_returns(trace_decay: float, n_step: int) -> None:
         )
 
 
+def target_lookahead(trace_decay: float, n_step: int, slice_len: int) -> int:
+    r"""Steps that should follow a sequence of ``slice_len`` trained ones, so that no target is cut short by its end.
+
+    An n-step target takes n - 1 of them. A target of Q(lambda) reaches over all that there are, with weights that fade;
+    it takes :math:`\lambda / (1 - \lambda)` on average, and so many are drawn, but no more than ``slice_len``.
+
+    Args:
+        trace_decay: lambda.
+        n_step: rewards of a target.
+        slice_len: steps that may be trained.
+
+    Examples:
+        >>> target_lookahead(0.0, 1, 8), target_lookahead(0.0, 5, 8), target_lookahead(0.8, 1, 8)
+        (0, 4, 4)
+    """
+    if not trace_decay:
+        return n_step - 1
+    if trace_decay == 1.0:
+        return slice_len
+    return min(slice_len, math.ceil(trace_decay / (1.0 - trace_decay) - 1e-6))
+
+
 def watkins_trace(greedy: Tensor, trace_decay: float) -> Tensor:
     """Watkins' cut: a target takes over the next one only if the next action is the greedy one.
 
@@ -187,7 +211,7 @@ def importance_weight(weight: Tensor) -> Tensor:
     return weight[:, 0] / weight[:, 0].max()
 
 
-def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_states: bool) -> Tensor:
+def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_states: bool, lookahead: int = 0) -> Tensor:
     """Which steps of sequences enter the loss (the paper: the last half).
 
     The state at the first steps of a sequence lacks the history before the slice, or was stored by older weights. It
@@ -199,6 +223,7 @@ def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_state
         burn_in: share of each sequence, rounded down to steps, that is left out at its beginning.
         train_exact_states: whether leading steps whose state is exact are trained nevertheless. Without it a short
             trajectory's first steps are never trained.
+        lookahead: steps at the end that the targets of others need and that are no part of the sequence.
 
     Returns:
         bool mask.
@@ -208,8 +233,9 @@ def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_state
         >>> training_mask(valid, init, burn_in=0.75, train_exact_states=True)
         tensor([[False,  True,  True,  True]])
     """
-    length = valid.shape[-1]
-    mask = (torch.arange(length, device=valid.device) >= int(length * burn_in)).expand_as(valid)
+    length = valid.shape[-1] - lookahead
+    step = torch.arange(valid.shape[-1], device=valid.device)
+    mask = (step >= int(length * burn_in)).expand_as(valid)
     if train_exact_states:
         mask = mask | (init.cumsum(-1) > 0)
-    return mask & valid
+    return mask & valid & (step < length)

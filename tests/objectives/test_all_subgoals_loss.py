@@ -29,6 +29,7 @@ DEFAULTS = {
     "max_meta_target": math.inf,
     "min_meta_target": -math.inf,
     "burn_in": 0.0,
+    "lookahead": 1,
     "train_exact_states": True,
     "loss_function": "l2",
 }
@@ -53,6 +54,8 @@ CHANGES = [
     {"wrong_subgoal_reward": 0.5},
     {"hazard_reward": 0.5},
     {"burn_in": 0.5, "train_exact_states": False},
+    {"lookahead": 3},
+    {"lookahead": 2, "burn_in": 0.5, "train_exact_states": False, "intra_option": False},
     {"loss_function": "smooth_l1"},
 ]
 
@@ -172,7 +175,8 @@ class Reference:
         sub, meta = {}, {}
         for b, t, g in product(range(self.rows), range(self.steps - 1), range(self.subgoals)):
             exact = self.s.train_exact_states and any(self.init[b][: t + 1])
-            if (t < int((self.steps - 1) * self.s.burn_in) and not exact) or t >= self.length[b]:
+            steps = self.steps - self.s.lookahead
+            if (t < int(steps * self.s.burn_in) and not exact) or t >= self.length[b] or t >= steps:
                 continue
             if self.trains_sub(b, t, g):
                 only_reaching_pays = max(self.s.wrong_subgoal_reward, self.s.hazard_reward) <= 0
@@ -498,10 +502,11 @@ class TestInTheEnvironment:
         loss, td = self.sample(settings, **options)
         result = loss(td)
         padded = not td.get(("collector", "mask"), torch.tensor(True)).all()
-        assert padded == (settings["sampling"] in ("whole_episodes", "steps"))
+        assert padded == (settings["sampling"] != "episode_starts")
         assert td["is_init"][:, 0].all() != settings.get("stored_state", False)
         others = {"burn_in": settings.get("burn_in", 0.5), "trace_decay": options.get("trace_decay", 0.8)}
-        sub, meta = Reference(self.values(loss, td), td, **others).run()
+        assert (loss.lookahead > 1) == (settings["sampling"] in ("steps", "episodes"))
+        sub, meta = Reference(self.values(loss, td), td, lookahead=loss.lookahead, **others).run()
         assert result["trained_steps"] == len(sub) > 100 and len(meta) > 50
         assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-4)
         assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-4)
@@ -651,6 +656,7 @@ def test_wrong_values(name, value):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
+        ({"lookahead": 0}, r"lookahead must be >= 1 step, got 0; "),
         ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
         ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
     ],

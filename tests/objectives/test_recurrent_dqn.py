@@ -117,6 +117,7 @@ def reference(
     state=None,
     weight=None,
     errors=None,
+    lookahead=0,
     **targets,
 ):
     """The loss by the book: one sequence, one step at a time. Returns it with the number of trained steps.
@@ -153,7 +154,7 @@ def reference(
         )
         for t in range(length):
             is_exact = exact and bool(init[0, : t + 1].any())
-            if (t < int(TIME * burn_in) and not is_exact) or t in row.cut:
+            if (t < int((TIME - lookahead) * burn_in) and not is_exact) or t in row.cut or t >= TIME - lookahead:
                 continue
             y = target(row, t, **targets)
             y = y if limit is None else min(y, torch.tensor(limit))
@@ -203,6 +204,9 @@ class TestAgainstPlainLoops:
             {"trace_decay": 0.75, "double": False, "burn_in": 0.0, "max_target": 0.2},
             {"n_step": 3},
             {"n_step": 2, "recurrent": False, "burn_in": 0.0},
+            {"n_step": 3, "lookahead": 2},
+            {"n_step": 2, "lookahead": 1, "recurrent": False},
+            {"trace_decay": 0.75, "lookahead": 3, "burn_in": 0.7},
         ],
         ids=str,
     )
@@ -215,13 +219,14 @@ class TestAgainstPlainLoops:
             network,
             sample,
             level=level,
-            burn_in=settings.get("burn_in", 0.5),
+            burn_in=settings.get("burn_in", 0.5) if settings.get("recurrent", True) else 0.0,  # no memory, no burn-in
             exact=settings.get("train_exact_states", True),
             double=settings.get("double", True),
             huber="loss_function" in settings,
             limit=settings.get("max_target"),
             decay=settings.get("trace_decay", 0.0),
             n=settings.get("n_step", 1),
+            lookahead=settings.get("lookahead", 0),
         )
         assert result["trained_steps"].item() == count
         torch.testing.assert_close(result["loss"], wanted)
@@ -645,6 +650,7 @@ class TestKeys:
         ("settings", "message"),
         [
             ({"gamma": 1.1}, r"gamma must lie in \[0, 1\], got 1.1; "),
+            ({"lookahead": -1}, r"lookahead must be >= 0 steps, got -1; "),
             ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
             ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
             ({"trace_decay": 1.1}, r"trace_decay must lie in \[0, 1\], got 1.1; "),

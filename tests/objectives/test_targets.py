@@ -8,6 +8,7 @@ from hdrqn_torchrl.objectives import (
     n_step_returns,
     sequence_priority,
     smdp_target,
+    target_lookahead,
     training_mask,
     watkins_trace,
 )
@@ -88,6 +89,40 @@ def test_smdp_target(reward, terminated, next_value, gamma, steps, target):
 )
 def test_training_mask(valid, init, burn_in, exact, mask):
     assert training_mask(flags(valid), flags(init), burn_in, exact).tolist() == flags(mask).tolist()
+
+
+@pytest.mark.parametrize(
+    ("valid", "init", "lookahead", "mask"),
+    [
+        ("11111111", "00000000", 2, "00011100"),  # half of six steps
+        ("11111111", "10000000", 2, "11111100"),
+        ("11111111", "00000001", 2, "00011100"),
+        ("11110000", "01000000", 2, "01110000"),
+        ("11111111", "00000000", 7, "10000000"),
+        ("11111111", "10000000", 8, "00000000"),
+    ],
+)
+def test_steps_that_serve_targets_only_are_not_trained_and_count_for_no_half(valid, init, lookahead, mask):
+    assert training_mask(flags(valid), flags(init), 0.5, True, lookahead).tolist() == flags(mask).tolist()
+
+
+@pytest.mark.parametrize(
+    ("trace_decay", "n_step", "slice_len", "steps"),
+    [
+        (0.0, 1, 8, 0),
+        (0.0, 5, 8, 4),
+        (0.0, 9, 2, 8),
+        (0.5, 1, 8, 1),
+        (0.8, 1, 8, 4),
+        (0.8, 1, 3, 3),
+        (0.85, 1, 8, 6),  # 5.67
+        (0.01, 1, 8, 1),
+        (0.99, 1, 50, 50),
+        (1.0, 1, 8, 8),
+    ],
+)
+def test_target_lookahead(trace_decay, n_step, slice_len, steps):
+    assert target_lookahead(trace_decay, n_step, slice_len) == steps
 
 
 def row(text):
