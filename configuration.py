@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.errors import InstantiationException
-from hydra.utils import instantiate
+from hydra.utils import get_object, instantiate
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
+
+from arguments import check_arguments, shown
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -55,6 +57,7 @@ class EvaluationSchema:
     interval_frames: int = MISSING
     final_episodes: int = MISSING
     seed: int = MISSING
+    ceilings: bool = True
     env: dict[str, Any] = field(default_factory=dict)  # settings of the environment that differ in evaluations
 
 
@@ -135,6 +138,9 @@ def check(config: DictConfig) -> None:
         raise SettingsError(
             f"device must be auto, cpu or cuda, got {config.device!r}; auto takes a GPU if there is one."
         )
+    loggers = OmegaConf.select(config, "logger.loggers")
+    if not isinstance(loggers, ListConfig):
+        raise SettingsError(f"logger.loggers must be a list, got {shown(loggers)}; [] writes metrics.csv alone.")
     check_targets(config, config.allowed_targets)
 
 
@@ -167,8 +173,23 @@ def _targets(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
             yield from _targets(item, f"{path}[{index}]")
 
 
+def check_types(config: DictConfig) -> None:
+    """Refuses values of other types than the builders' annotations ask for. It loads what is to be built.
+
+    Raises:
+        ValueError: with key, rule and value.
+    """
+    for name in ("env", "algo", "network"):
+        check_arguments(config[name], name, get_object)
+    played = {"_target_": config.env._target_, **config.evaluation.env}
+    check_arguments(played, "evaluation.env", get_object)
+    for index, logger in enumerate(config.logger.loggers):
+        check_arguments(logger, f"logger.loggers[{index}]", get_object)
+
+
 def build_algorithm(config: DictConfig, **env_changes) -> tuple[EnvBase, Algorithm]:
     """The bare environment and the algorithm of a configuration."""
+    check_types(config)
     env = instantiate(config.env, **env_changes)
     return env, instantiate(config.algo, env, instantiate(config.network))
 

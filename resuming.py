@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from configuration import SettingsError, check, read_choices, read_config
 
-FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets")
+FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets", "evaluation.ceilings")
 """Settings that may differ when a run is resumed: they don't change what is learned."""
 
 
@@ -150,7 +150,7 @@ def differences(stored: DictConfig, config: DictConfig) -> list[str]:
     changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
     for key in sorted(before.keys() | after.keys()):
         old, new = before.get(key, "(not set)"), after.get(key, "(not set)")
-        if old != new and key.partition(".")[0] not in FREE:
+        if old != new and not {key, key.partition(".")[0]} & set(FREE):
             changed.append(f"{key}: {old} -> {new}")
     return changed
 

@@ -16,7 +16,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 import sweeps
 from configuration import RunError, SettingsError, build_algorithm, check, explain, pick_device
@@ -61,19 +61,28 @@ def train(run: Plan) -> float:
     import torch
     from torchrl.checkpoint import CheckpointError
 
-    from hdrqn_torchrl.finite import NonFiniteError
     from hdrqn_torchrl.run_folder import locked
 
     torch.set_num_threads(run.config.threads)
+    patience = sweeps.PATIENCE_SECONDS if HydraConfig.get().mode == RunMode.MULTIRUN else 0.0
+    with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
+        refused = (InstantiationException, ValueError, CheckpointError) if run.resumed else ()
+        with noting_errors(run, unless=refused):
+            trainer, evaluation_env, references = begin(run)
+        with noting_errors(run):
+            trainer.train()
+            return write_summary(run, trainer, evaluation_env, references)["return_mean"]
+
+
+@contextlib.contextmanager
+def in_words(run: Plan) -> Iterator[None]:
+    """Turns what a user can get wrong, and what a machine can do wrong, into messages without a traceback."""
+    from torchrl.checkpoint import CheckpointError
+
+    from hdrqn_torchrl.finite import NonFiniteError
+
     try:
-        patience = sweeps.PATIENCE_SECONDS if HydraConfig.get().mode == RunMode.MULTIRUN else 0.0
-        with locked(run.folder, patience_seconds=patience, tell=tell):
-            refused = (InstantiationException, ValueError, CheckpointError) if run.resumed else ()
-            with noting_errors(run, unless=refused):
-                trainer, evaluation_env, references = begin(run)
-            with noting_errors(run):
-                trainer.train()
-                return write_summary(run, trainer, evaluation_env, references)["return_mean"]
+        yield
     except (InstantiationException, ValueError) as error:
         raise SettingsError(explain(error)) from error
     except (CheckpointError, NonFiniteError) as error:
@@ -86,6 +95,11 @@ def train(run: Plan) -> float:
 def tell(sentence: str) -> None:
     """Says on the terminal what takes long."""
     print(sentence, file=sys.stderr, flush=True)
+
+
+def tell_of_player(sentence: str) -> None:
+    """The same for scripted players, which can be done without."""
+    tell(f"{sentence}; evaluation.ceilings=false leaves that out")
 
 
 @contextlib.contextmanager
@@ -127,8 +141,10 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
 def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, references: dict) -> dict[str, Any]:
     """Final greedy evaluation; writes and prints the run's results."""
     from hdrqn_torchrl.evaluation import evaluate
-    from hdrqn_torchrl.run_folder import write_results
+    from hdrqn_torchrl.run_folder import references_for, write_results
 
+    if references:  # the others come last: training need not wait for them
+        references = references_for(evaluation_env.base_env, tell=tell_of_player)
     result = evaluate(
         evaluation_env,
         trainer.algorithm.policy,
@@ -150,6 +166,7 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
 
     from hdrqn_torchrl.checkpoint import Checkpoints
     from hdrqn_torchrl.collectors import ResumableCollector
+    from hdrqn_torchrl.envs.specs import interface_differences
     from hdrqn_torchrl.evaluation import evaluate
     from hdrqn_torchrl.logging import RunLogger
     from hdrqn_torchrl.run_folder import ceiling_of, references_for
@@ -162,8 +179,16 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     torch.manual_seed(config.seed)
     env, algorithm = build_algorithm(config, seed=config.seed, device=device)
     played = {"num_envs": config.evaluation.num_envs, "device": device, **config.evaluation.env}
-    evaluation_env = algorithm.transform(instantiate(config.env, **played))
-    references = references_for(env)
+    evaluation_base = instantiate(config.env, **played)
+    if found := interface_differences(env, evaluation_base):
+        raise ValueError(
+            f"evaluation.env must leave what the agent sees and does as it is in training, got "
+            f"{OmegaConf.to_container(config.evaluation.env)}: {found}; set env.KEY for both."
+        )
+    evaluation_env = algorithm.transform(evaluation_base)
+    references = (
+        references_for(evaluation_env.base_env, ["memory"], tell=tell_of_player) if config.evaluation.ceilings else {}
+    )
     frames_per_batch = env.batch_size[0] * config.steps_per_batch
     collector = ResumableCollector(
         algorithm.transform(env),

@@ -114,6 +114,7 @@ class LearnerSettings:
                 "use None for a constant rate",
             ),
             ("learning_rate_frames", self.learning_rate_frames >= 1, ">= 1", "use the frames of the whole training"),
+            ("burn_in", 0 <= self.burn_in < 1, "in [0, 1)", "the paper's last-half rule is 0.5"),
             ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
             (
                 "train_exact_states",

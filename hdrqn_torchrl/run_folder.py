@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.envs.ceilings import ceiling
-from hdrqn_torchrl.envs.scripted import PLAYERS
+from hdrqn_torchrl.envs.scripted import PLAYERS, PlayerName
 from hdrqn_torchrl.locking import InUse, lock
 from hdrqn_torchrl.plotting import plot_run, read_metrics
 from hdrqn_torchrl.run_files import replaced, write_whole
@@ -77,11 +77,19 @@ def locked(folder: Path, *, patience_seconds: float = 0.0, tell: Callable[[str],
         yield
 
 
-def references_for(env: EnvBase) -> References:
-    """What the scripted players achieve on the task of ``env``, by name; empty for tasks that have none."""
+def references_for(
+    env: EnvBase, players: Sequence[PlayerName] = tuple(PLAYERS), *, tell: Callable[[str], None] | None = None
+) -> References:
+    """What the scripted players achieve on the task of ``env``, by name; empty for tasks that have none.
+
+    Args:
+        env: the bare environment.
+        players: which of them.
+        tell: called with a sentence before each that has to be simulated.
+    """
     if not isinstance(env, MultiGoalGridEnv):
         return {}
-    return {player: ceiling(player, env) for player in PLAYERS}
+    return {player: ceiling(player, env, tell=tell) for player in players}
 
 
 def ceiling_of(references: References) -> float | None:

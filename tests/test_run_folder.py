@@ -6,9 +6,11 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from helpers import small_env
 from processes import start
 
-from hdrqn_torchrl.run_folder import ceiling_of, locked, write_results
+from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.run_folder import ceiling_of, locked, references_for, write_results
 
 REFERENCES = {"planner": {"return_mean": 2.0}, "memory": {"return_mean": 1.9, "steps_mean": 16.5}}
 RESULT = {"return_mean": 0.5, "success_rate": 0.25, "in_order_rate": 0.4, "steps_mean": 40.0, "episodes": 100}
@@ -39,6 +41,15 @@ def test_a_task_without_scripted_players_has_no_ceiling(folder):
 def test_the_ceiling_is_that_of_the_player_with_the_agents_view():
     assert ceiling_of(REFERENCES) == 1.9
     assert ceiling_of({"planner": {"return_mean": 2.0}}) is None
+
+
+def test_players_that_have_to_play_are_told_of():
+    told = []
+    measured = references_for(MultiGoalGridEnv(2), tell=told.append)
+    assert list(measured) == ["planner", "memory", "egocentric", "random"] and told == []
+    played = references_for(small_env(2), ["memory"], tell=told.append)
+    assert list(played) == ["memory"] and played["memory"]["episodes"] == 1000
+    assert told == ["the scripted player 'memory' plays 1,000 episodes of this task"]
 
 
 def hold(folder):

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
@@ -60,7 +60,14 @@ MEASURED: dict[StandardTask, tuple[float, float, float]] = {  # return_mean, suc
 }
 
 
-def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, seed: int = 0) -> dict[str, float]:
+def ceiling(
+    player: PlayerName,
+    env: MultiGoalGridEnv,
+    *,
+    episodes: int = 1000,
+    seed: int = 0,
+    tell: Callable[[str], None] | None = None,
+) -> dict[str, float]:
     """What a scripted player achieves on a task: looked up for the paper's tasks, simulated for all others.
 
     Args:
@@ -69,6 +76,7 @@ def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, 
         env: the environment whose task is meant; it is not played.
         episodes: number of episodes of a simulation.
         seed: seed of a simulation.
+        tell: called with a sentence before a simulation, which on a large map takes minutes.
 
     Returns:
         ``return_mean``, ``success_rate`` (share of episodes with all goals reached in order), ``steps_mean`` and
@@ -88,6 +96,8 @@ def ceiling(player: PlayerName, env: MultiGoalGridEnv, *, episodes: int = 1000, 
         if figures is not None:
             names = ("return_mean", "success_rate", "steps_mean")
             return dict(zip(names, figures, strict=True)) | {"episodes": MEASURED_EPISODES}
+    if tell is not None:
+        tell(f"the scripted player {player!r} plays {episodes:,} episodes of this task")
     return scripted_ceiling(player, **task, episodes=episodes, seed=seed)
 
 

@@ -3,9 +3,41 @@
 from __future__ import annotations
 
 import torch
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
+
+
+def interface(env: EnvBase) -> dict[str, str]:
+    """What the networks of an agent are made for: kind and shape of all that it sees and does, of one environment.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> interface(MultiGoalGridEnv(4, view=5))["action"]
+        'int64 [] below 4'
+    """
+    batch = len(env.batch_size)
+    specs = {**dict(env.observation_spec.items(True, True)), **dict(env.full_action_spec.items(True, True))}
+    return {
+        ".".join(key) if isinstance(key, tuple) else key: _in_words(spec, list(spec.shape[batch:]))
+        for key, spec in specs.items()
+    }
+
+
+def _in_words(spec: TensorSpec, shape: list[int]) -> str:
+    below = f" below {spec.space.n}" if type(spec) is Categorical else ""  # not of flags
+    return f"{str(spec.dtype).removeprefix('torch.')} {shape}{below}"
+
+
+def interface_differences(env: EnvBase, other: EnvBase) -> str:
+    """In words, what agents made for ``env`` would see or do otherwise in ``other``; empty if nothing."""
+    before, after = interface(env), interface(other)
+    return ", ".join(
+        f"{key} is {after.get(key, 'missing')} instead of {before.get(key, 'missing')}"
+        for key in {**before, **after}
+        if before.get(key) != after.get(key)
+    )
 
 
 def flags(num_envs: int, size: int, *, device: torch.device | None = None) -> Binary:

@@ -1,0 +1,131 @@
+"""Types of settings: what a builder's annotations ask for, checked before it is called.
+
+So every builder and settings class, one's own included, refuses ``algo.sub.batch_size=1.5`` in the same words.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import types
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+TARGET = "_target_"
+REMEDY = "`python train.py --cfg job` shows every setting and its default"
+_IN_WORDS: dict[Any, str] = {
+    type(None): "null", bool: "true or false", int: "an integer", float: "a finite number", str: "a text",
+}  # fmt: skip
+
+
+def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
+    """Checks the types of all settings below ``path``.
+
+    Args:
+        node: settings with a ``_target_``, plain or OmegaConf's; those below it may have targets, too.
+        path: their full name, for the message.
+        locate: finds what a ``_target_`` names.
+
+    Raises:
+        ValueError: with the full name of the first setting of another type than its builder's annotations ask for.
+
+    Examples:
+        >>> from hdrqn_torchrl.modules import EpsilonGreedy
+        >>> check_arguments({"_target_": "epsilon", "start": 1}, "exploration", lambda _: EpsilonGreedy)
+        >>> check_arguments({"_target_": "epsilon", "start": "high"}, "exploration", lambda _: EpsilonGreedy)
+        Traceback (most recent call last):
+        ...
+        ValueError: exploration.start must be a finite number, got 'high'; `python train.py --cfg job` shows every setting and its default.
+    """  # noqa: E501
+    if not isinstance(node, Mapping) or not isinstance(node.get(TARGET), str):
+        raise ValueError(f"{path} must be settings with a {TARGET}, got {shown(node)}; {REMEDY}.")
+    hints = annotations_of(locate(node[TARGET]))
+    for name, value in _settings(node):
+        full = f"{path}.{name}"
+        if isinstance(value, Mapping) and TARGET in value:
+            check_arguments(value, full, locate)
+        elif name in hints and not fits(value, hints[name]):
+            raise ValueError(f"{full} must be {in_words(hints[name])}, got {shown(value)}; {REMEDY}.")
+
+
+def _settings(node: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Without Hydra's own (``_target_``, ``_recursive_``, ...)."""
+    return ((str(name), value) for name, value in node.items() if not str(name).startswith("_"))
+
+
+def annotations_of(builder: Callable) -> dict[str, Any]:
+    """What the arguments of a function or class may be; none if its annotations can't be read."""
+    try:
+        return get_type_hints(builder.__init__ if inspect.isclass(builder) else builder)
+    except NameError:  # of someone else's builder, with names that only type checkers import
+        return {}
+
+
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a plain value (a number, a text, a list, ...) is what an annotation allows.
+
+    Examples:
+        >>> fits(3, float), fits(3.0, int), fits(True, int), fits([1, 2], Sequence[int]), fits(None, int | None)
+        (True, False, False, True, True)
+    """
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return any(fits(value, each) for each in arguments)
+    if origin is Literal:
+        return any(value == each and type(value) is type(each) for each in arguments)
+    if hint in (None, type(None)):
+        return value is None
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    if hint in (bool, str):
+        return isinstance(value, hint)
+    kind = origin or hint
+    if not inspect.isclass(kind) or kind is object:
+        return True  # Any and the like
+    if issubclass(kind, Mapping):
+        return isinstance(value, Mapping)
+    if issubclass(kind, Sequence):
+        is_list = isinstance(value, Sequence) and not isinstance(value, str)
+        return is_list and all(fits(each, arguments[0]) for each in value) if arguments else is_list
+    return isinstance(value, kind)  # an object, which is built from settings of its own
+
+
+def in_words(hint: Any) -> str:
+    """What an annotation allows.
+
+    Examples:
+        >>> in_words(int | None), in_words(Literal["l2", "smooth_l1"]), in_words(Sequence[int])
+        ('an integer or null', "one of 'l2', 'smooth_l1'", 'a list of integers')
+    """
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        named = tuple(name for each in arguments if get_origin(each) is Literal for name in get_args(each))
+        rest = [each for each in arguments if get_origin(each) is not Literal]
+        return " or ".join(in_words(each) for each in ([Literal[named]] if named else []) + rest)
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, arguments))}"
+    if hint in _IN_WORDS:
+        return _IN_WORDS[hint]
+    kind = origin or hint
+    if inspect.isclass(kind) and issubclass(kind, Mapping):
+        return "settings by name"
+    if inspect.isclass(kind) and issubclass(kind, Sequence):
+        return f"a list of {_plural(arguments[0])}" if arguments else "a list"
+    return f"settings with a {TARGET} that builds {getattr(kind, '__name__', kind)}"
+
+
+def _plural(hint: Any) -> str:
+    return {int: "integers", float: "finite numbers", str: "texts"}.get(hint, in_words(hint))
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in settings, shortened.
+
+    Examples:
+        >>> shown(None), shown(True), shown("a")
+        ('null', 'true', "'a'")
+    """
+    text = "null" if value is None else str(value).lower() if isinstance(value, bool) else repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
