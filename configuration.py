@@ -58,6 +58,7 @@ class EvaluationSchema:
     final_episodes: int = MISSING
     seed: int = MISSING
     ceilings: bool = True
+    max_steps: int | None = None  # of an episode
     env: dict[str, Any] = field(default_factory=dict)  # settings of the environment that differ in evaluations
 
 
@@ -130,6 +131,11 @@ def check(config: DictConfig) -> None:
         value = OmegaConf.select(config, key)
         if value < least:
             raise SettingsError(f"{key} must be >= {least}, got {value}; leave it out for the default.")
+    longest = config.evaluation.max_steps
+    if longest is not None and longest < 1:
+        raise SettingsError(
+            f"evaluation.max_steps must be >= 1 or null, got {longest}; null plays episodes to their end."
+        )
     if config.checkpoint.interval_minutes <= 0:
         raise SettingsError(
             f"checkpoint.interval_minutes must be > 0, got {config.checkpoint.interval_minutes}; use 10."

@@ -8,6 +8,7 @@
     num_envs        worlds that are played at the same time (250)
     seed            of the worlds (default: that of the run's own summary, evaluation.seed + 1). With the same seed,
                     num_envs and env.KEY episode i begins in the same world for every agent
+    max_steps       steps after which an episode is cut off, if it has not ended (the run's evaluation.max_steps)
     epsilon         probability of a random choice, at each level (0: greedy)
     env.KEY         setting of the task that shall differ from the run's, e.g. env.view=3 env.layout=four_rooms
     out             file to write the object to as well
@@ -49,6 +50,7 @@ class Settings:
     episodes: int = 1000
     num_envs: int = 250
     seed: int | None = None
+    max_steps: int | None = None
     epsilon: float = 0.0
     env: dict[str, Any] = field(default_factory=dict)
     out: str | None = None
@@ -98,14 +100,18 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
     greedy = settings.epsilon == 0.0
     seed = agent.config.evaluation.seed + 1 if settings.seed is None else settings.seed
     observers = observers_of(agent.env)
-    played = play(
-        agent.env,
-        agent.algorithm.policy,
-        episodes=settings.episodes,
-        seed=seed,
-        exploration_type=ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM,
-        observers=list(observers.values()),
-    )
+    try:
+        played = play(
+            agent.env,
+            agent.algorithm.policy,
+            episodes=settings.episodes,
+            seed=seed,
+            exploration_type=ExplorationType.DETERMINISTIC if greedy else ExplorationType.RANDOM,
+            observers=list(observers.values()),
+            max_steps=agent.config.evaluation.max_steps if settings.max_steps is None else settings.max_steps,
+        )
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
     if settings.figures is not None:
         draw(observers, agent.env.base_env, Path(settings.figures))
     references = references_for(agent.env.base_env, tell=tell) if settings.ceilings else {}

@@ -150,6 +150,7 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, referenc
         trainer.algorithm.policy,
         episodes=run.config.evaluation.final_episodes,
         seed=run.config.evaluation.seed + 1,
+        max_steps=run.config.evaluation.max_steps,
     )
     groups = (f"{name}={run.choices[name]}" for name in ("env", "algo", "network") if name in run.choices)
     title = " ".join([*groups, f"seed={run.config.seed}"])
@@ -208,7 +209,11 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
             label=run.folder.name if HydraConfig.get().mode == RunMode.MULTIRUN else "",
         ),
         evaluate=lambda: evaluate(
-            evaluation_env, algorithm.policy, episodes=config.evaluation.episodes, seed=config.evaluation.seed
+            evaluation_env,
+            algorithm.policy,
+            episodes=config.evaluation.episodes,
+            seed=config.evaluation.seed,
+            max_steps=config.evaluation.max_steps,
         ),
         total_frames=config.total_frames,
         log_frames=config.log_frames,

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs import Task, task_of
 from hdrqn_torchrl.intervals import CONFIDENCE, mean_interval, share_interval
 from hdrqn_torchrl.isolation import isolated
 
@@ -22,6 +23,17 @@ _SUMMED = {
     "intrinsic": keys.INTRINSIC_REWARD,
     "success": keys.SUCCESS,
 }
+_FIGURES = {
+    "return_mean": "return",
+    "extrinsic_mean": "extrinsic",
+    "intrinsic_mean": "intrinsic",
+    "success_rate": "success",
+    "in_order_rate": "in_order",
+    "steps_mean": "steps",
+    "cut_off_rate": "cut_off",
+}
+LONGEST_EPISODE = 30_000
+"""Steps after which an episode of unknown length is taken to have no end; those of Atari games have 27,000."""
 
 
 class Observer(Protocol):
@@ -62,17 +74,18 @@ class PlaceCounter:
 class EpisodeTracker:
     """Sums what happens in each of N environments and reports the episodes that end.
 
-    Reported per episode: ``return``, ``extrinsic``, ``intrinsic`` (hierarchical agents), ``success`` (1 if the whole
-    task was completed), ``in_order`` (share of subgoals reached in the proper order, i.e. with an extrinsic
-    reward of at least 1) and ``steps``.
+    Reported per episode: ``return``, ``steps`` and, as far as environment and agent have them, ``extrinsic``,
+    ``intrinsic``, ``success`` (1 if the whole task was completed) and ``in_order`` (share of subgoals reached in the
+    proper order, where the task has one).
 
     Args:
+        task: says how ``in_order`` is counted.
         per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
             attained, options for it that ended, and those of them that reached it.
     """
 
-    def __init__(self, *, per_subgoal: bool = False) -> None:
-        self.per_subgoal = per_subgoal
+    def __init__(self, task: Task = Task(), *, per_subgoal: bool = False) -> None:  # noqa: B008 (frozen)
+        self.task, self.per_subgoal = task, per_subgoal
         self.sums: TensorDictBase | None = None  # [N]
 
     def add(self, after: TensorDictBase) -> TensorDictBase:
@@ -82,7 +95,8 @@ class EpisodeTracker:
             The sums ``[N]`` up to and including this step; those of ended episodes are cleared afterwards.
         """
         step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after}
-        step["in_order"] = (step["extrinsic"] >= 1.0).float() / after.get(keys.ATTAINED).shape[-1]
+        if self.task.in_order is not None:
+            step["in_order"] = self.task.in_order(after)
         step["steps"] = torch.ones_like(step["return"])
         if self.per_subgoal:
             step |= _subgoal_events(after)
@@ -109,6 +123,8 @@ class EpisodeTracker:
 
 def _subgoal_events(after: TensorDictBase) -> dict[str, Tensor]:
     """What happened to each subgoal in one step, ``[N, G]`` each."""
+    if keys.ATTAINED not in after:
+        return {}
     attained = after.get(keys.ATTAINED).float()
     if keys.OPTION_DONE not in after:
         return {"attained": attained}
@@ -129,6 +145,7 @@ def play(
     seed: int = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     observers: Sequence[Observer] = (),
+    max_steps: int | None = None,
 ) -> TensorDictBase:
     """Plays episodes, in rounds of one in each environment.
 
@@ -148,14 +165,22 @@ def play(
         seed: of the first round; those of the others are derived from it.
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
         observers: are shown every step, those after the end of an environment's last episode as well.
+        max_steps: episodes are cut off after so many steps, if they have not ended before; ``None``: not at all.
 
     Returns:
-        One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)``.
+        One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)`` and, if ``max_steps`` is
+        given, ``cut_off`` (1 if it was).
+
+    Raises:
+        ValueError: if ``max_steps`` is below 1, or if without it an episode does not end: after as many steps as the
+            task states or, if it states none, :data:`LONGEST_EPISODE`.
     """
-    rounds = []
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None plays episodes to their end.")
+    rounds, task = [], task_of(env)
     for number in range(-(-episodes // env.batch_size[0])):
         with isolated(env, policy, seed=seed_of_round(seed, number), exploration_type=exploration_type):
-            rounds.append(_play_once(env, policy, observers))
+            rounds.append(_play_once(env, policy, observers, task, max_steps))
     return torch.cat(rounds, 0)  # type: ignore[return-value]
 
 
@@ -178,28 +203,22 @@ def evaluate(
     episodes: int,
     seed: int = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    max_steps: int | None = None,
 ) -> dict[str, float]:
     """Plays episodes and averages them; arguments as in :func:`play`.
 
     Returns:
-        ``return_mean``, ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete
-        the whole task), ``in_order_rate`` (share of subgoals reached in the proper
-        order), ``steps_mean``, ``episodes``.
+        ``return_mean``, ``steps_mean``, ``episodes`` and, as far as environment and agent have them,
+        ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete the whole task),
+        ``in_order_rate`` (share of subgoals reached in the proper order), ``cut_off_rate``.
     """
-    played = play(env, policy, episodes=episodes, seed=seed, exploration_type=exploration_type)
+    played = play(env, policy, episodes=episodes, seed=seed, exploration_type=exploration_type, max_steps=max_steps)
     return {**{name: _mean(values) for name, values in columns(played).items()}, "episodes": len(played)}
 
 
 def columns(played: TensorDictBase) -> dict[str, Tensor]:
     """The figures that a result consists of, one value per episode ``[M]`` each."""
-    return {
-        "return_mean": played["return"],
-        "extrinsic_mean": played["extrinsic"],
-        "intrinsic_mean": played["intrinsic"] if "intrinsic" in played else torch.zeros_like(played["return"]),
-        "success_rate": played["success"],
-        "in_order_rate": played["in_order"],
-        "steps_mean": played["steps"],
-    }
+    return {name: played[entry] for name, entry in _FIGURES.items() if entry in played}
 
 
 def summarise(played: TensorDictBase, *, confidence: float = CONFIDENCE) -> dict[str, Any]:
@@ -218,7 +237,7 @@ def summarise(played: TensorDictBase, *, confidence: float = CONFIDENCE) -> dict
     figures = columns(played)
     result: dict[str, Any] = {name: _mean(values) for name, values in figures.items()}
     result |= {"episodes": len(played), "per_subgoal": []}
-    for subgoal in range(played["attained"].shape[-1]):
+    for subgoal in range(played["attained"].shape[-1] if "attained" in played else 0):
         entry: dict[str, float | None] = {"attained": _mean((played["attained"][:, subgoal] > 0).float())}
         if "chosen" in played:
             options = played["chosen"][:, subgoal].sum().item()
@@ -237,12 +256,15 @@ def _interval(name: str, values: Tensor, confidence: float) -> list[float] | Non
     return None if numpy.isnan(low) else [low.item(), high.item()]
 
 
-def _play_once(env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[Observer]) -> TensorDictBase:
+def _play_once(
+    env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[Observer], task: Task, max_steps: int | None
+) -> TensorDictBase:
     """One episode in each environment, ``[N]``."""
-    tensordict, tracker = env.reset(), EpisodeTracker(per_subgoal=True)
+    tensordict, tracker = env.reset(), EpisodeTracker(task, per_subgoal=True)
     playing = torch.ones(env.batch_size, dtype=torch.bool, device=tensordict.device)
     episodes: TensorDictBase | None = None
-    while playing.any():
+    longest = max_steps or task.max_steps or LONGEST_EPISODE
+    for _ in range(longest):
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))
         after = tensordict.get("next")
         sums = tracker.add(after)
@@ -251,7 +273,18 @@ def _play_once(env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[O
         ended = playing & after.get(keys.DONE).squeeze(-1)
         episodes = sums if episodes is None else torch.where(ended, sums, episodes)
         playing, tensordict = playing & ~ended, following
+        if not playing.any():
+            break
     assert episodes is not None
+    if max_steps is not None:
+        cut: TensorDictBase = torch.where(playing, sums, episodes)  # type: ignore[assignment]
+        return cut.set("cut_off", playing.float())
+    if playing.any():
+        raise ValueError(
+            f"env must end its episodes, got {int(playing.sum())} of {len(playing)} that had not ended after "
+            f"{longest:,} steps; give it a time limit (StepCounter(max_steps=...), before the agent's own transforms), "
+            "state the length of longer ones in its task, or let evaluations cut them off (max_steps)."
+        )
     return episodes
 
 

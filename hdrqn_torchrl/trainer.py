@@ -70,7 +70,10 @@ class Trainer:
         self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
-        self._tracker, self._window = EpisodeTracker(per_subgoal=algorithm.phases is not None), _Window()
+        self._tracker, self._window = (
+            EpisodeTracker(algorithm.task, per_subgoal=algorithm.phases is not None),
+            _Window(),
+        )
         self._stop = StopRequest()
         self._started = self._saved_at = time.monotonic()
         self._saved_position: tuple | None = None

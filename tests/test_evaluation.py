@@ -4,15 +4,17 @@ from helpers import LEFT, RIGHT, build, collect, small_env, subgoal_env
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
+from user_envs import Corridor
 
+from hdrqn_torchrl.envs import Task, goals_in_order, task_of
 from hdrqn_torchrl.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round, summarise
 
 PAIR = ("####", "#  #", "####")  # agent and goal side by side
 TRACKED = ("return", "extrinsic", "intrinsic", "success", "in_order", "steps")
 
 
-def pair_env(num_envs):
-    return small_env(num_envs, layout=PAIR, num_obstacles=0, num_goals=1, max_steps=3)
+def pair_env(num_envs, max_steps=3):
+    return small_env(num_envs, layout=PAIR, num_obstacles=0, num_goals=1, max_steps=max_steps)
 
 
 def always(action):
@@ -35,7 +37,7 @@ class TestEvaluate:
         for key in ("return_mean", "extrinsic_mean", "success_rate", "in_order_rate"):
             assert result[key] == pytest.approx(lucky), key
         assert result["steps_mean"] == pytest.approx(lucky * 1 + (1 - lucky) * 3)
-        assert result["intrinsic_mean"] == 0.0
+        assert "intrinsic_mean" not in result
 
     @pytest.mark.parametrize(("episodes", "played"), [(1, 4), (4, 4), (5, 8), (12, 12)])
     def test_every_environment_plays_equally_often(self, episodes, played):
@@ -143,7 +145,7 @@ class TestEpisodeTracker:
         torch.manual_seed(0)
         env = small_env(5)
         batches = collect(build("v2", env), env, 3, batches=20)
-        tracker, expected, open_sums = EpisodeTracker(), [], [dict.fromkeys(TRACKED, 0.0) for _ in range(5)]
+        tracker, expected, open_sums = EpisodeTracker(task_of(env)), [], [dict.fromkeys(TRACKED, 0.0) for _ in range(5)]
         for batch in batches:
             ended = []
             for t in range(3):
@@ -167,8 +169,67 @@ class TestEpisodeTracker:
 
     def test_flat_agents_have_no_intrinsic_reward(self):
         env = small_env(5)
-        finished = EpisodeTracker().finished(collect(build("drqn", env), env, 10)[0])
+        finished = EpisodeTracker(task_of(env)).finished(collect(build("drqn", env), env, 10)[0])
         assert set(finished.keys()) == set(TRACKED) - {"intrinsic"}
+
+
+class TestTasksOfOthers:
+    """A user's environment has fewer entries, and its episodes may be long or have no end."""
+
+    STATED = Task(max_steps=6, in_order=goals_in_order(2))
+
+    def played(self, name="v2", **settings):
+        env = Corridor(4, **settings)
+        algorithm = build(name, env)
+        return evaluate(algorithm.transform(env), algorithm.policy, episodes=4)
+
+    @pytest.mark.parametrize(
+        ("name", "without", "task", "figures"),
+        [
+            ("v2", ("hazard", "success"), None, {"extrinsic_mean", "intrinsic_mean"}),
+            ("v3", ("hazard",), None, {"extrinsic_mean", "intrinsic_mean", "success_rate"}),
+            ("v1", ("success",), STATED, {"extrinsic_mean", "intrinsic_mean", "in_order_rate"}),
+            ("dqn", ("attained", "extrinsic_reward", "hazard", "success"), None, set()),
+        ],
+    )
+    def test_a_result_has_the_figures_that_agent_and_environment_know(self, name, without, task, figures):
+        env = Corridor(4, without=without, task=task)
+        algorithm = build(name, env)
+        played = play(algorithm.transform(env), algorithm.policy, episodes=4)
+        result = summarise(played)
+        assert set(result["intervals"]) == {"return_mean", "steps_mean"} | figures
+        assert set(result) == set(result["intervals"]) | {"episodes", "per_subgoal", "intervals"}
+        assert len(result["per_subgoal"]) == (0 if name == "dqn" else 2)
+
+    def test_large_rewards_are_no_goals_in_order(self):
+        """Ten a goal, and many of them: the rate was 13.5 once."""
+        result = self.played(pays=27.0, without=("success",))
+        assert "in_order_rate" not in result
+        assert "in_order" not in EpisodeTracker().finished(collect(build("v1", Corridor(4)), Corridor(4), 8)[0])
+
+    def test_an_episode_without_end_is_an_error_and_not_for_ever(self, monkeypatch):
+        monkeypatch.setattr("hdrqn_torchrl.evaluation.LONGEST_EPISODE", 40)
+        with pytest.raises(
+            ValueError, match=r"env must end its episodes, got 4 of 4 .* after 40 steps; give it a time"
+        ):
+            self.played(length=None)
+        with pytest.raises(ValueError, match="got 4 of 4 that had not ended after 5 steps"):
+            self.played(length=6, task=Task(max_steps=5))
+        assert self.played(length=41, task=Task(max_steps=41))["steps_mean"] == 41
+
+    @pytest.mark.parametrize(("length", "steps", "cut"), [(None, 9, 1.0), (6, 6, 0.0), (9, 9, 0.0)])
+    def test_evaluations_can_cut_episodes_off_and_say_so(self, length, steps, cut):
+        env = Corridor(4, length=length)
+        algorithm = build("v1", env)
+        result = evaluate(algorithm.transform(env), algorithm.policy, episodes=8, max_steps=9)
+        assert (result["steps_mean"], result["cut_off_rate"], result["episodes"]) == (steps, cut, 8)
+
+    def test_what_was_collected_until_then_counts(self):
+        env = Corridor(4, length=None)  # to the right end in two steps, and there it stays
+        right = TensorDictModule(lambda place: torch.ones(len(place), dtype=torch.int64), ["observation"], ["action"])
+        assert evaluate(env, right, episodes=4, max_steps=7)["return_mean"] == 1.0
+        with pytest.raises(ValueError, match="max_steps must be >= 1 or None, got 0"):
+            evaluate(env, right, episodes=4, max_steps=0)
 
 
 class TestPerSubgoal:
@@ -210,8 +271,10 @@ class TestIntervals:
         assert width(800) == pytest.approx(width(50) / 4, rel=0.3)
 
     def test_figures_that_never_differ_have_none(self):
-        summary = summarise(play(pair_env(4), always_right(), episodes=4))
-        assert summary["intervals"]["intrinsic_mean"] is None
+        env = pair_env(4, max_steps=1)
+        summary = summarise(play(env, always_right(), episodes=4, max_steps=1))
+        assert summary["intervals"]["cut_off_rate"][0] == 0.0
+        assert summary["intervals"]["steps_mean"] is None
 
     def test_one_episode_has_none_but_of_rates(self):
         intervals = summarise(play(pair_env(1), always_right(), episodes=1))["intervals"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from tensordict import NestedKey, TensorDictBase
@@ -13,6 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
+from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
@@ -23,13 +24,14 @@ Controller = SubController | MetaController | AllSubgoalsPolicy
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """A policy, its learners (one per level, by name) and the transforms its environment needs."""
+    """A policy, its learners (one per level, by name), the transforms its environment needs, and what that states."""
 
     policy: TensorDictModuleBase
     learners: dict[str, Learner]
     explorations: dict[str, EpsilonGreedy]
     make_transforms: Callable[[], Compose]
     phases: Phases | None = None
+    task: Task = field(default_factory=Task)
 
     def transform(self, env: EnvBase) -> TransformedEnv:
         """The environment as this algorithm sees it."""

@@ -73,6 +73,7 @@ def make_drqn(
         policy=policy,
         learners={"flat": flat},
         explorations={"flat": exploration},
+        task=has.task,
         make_transforms=copies_of(InitTracker(), policy.make_tensordict_primer()),
     )
 

@@ -238,6 +238,7 @@ def make_hdrqn(
         policy=policy,
         learners={"sub": sub_learner, "meta": meta_learner},
         explorations={"sub": sub_exploration, "meta": meta_exploration},
+        task=has.task,
         make_transforms=copies_of(InitTracker(), subgoals, *primers),
         phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, meta_learner),
     )

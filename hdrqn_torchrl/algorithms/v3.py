@@ -185,6 +185,7 @@ def make_v3(
         policy=policy,
         learners={"joint": trained},
         explorations={"sub": sub_exploration, "meta": meta_exploration},
+        task=has.task,
         make_transforms=copies_of(InitTracker(), subgoals, policy.make_tensordict_primer()),
         phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, None),
     )

@@ -11,7 +11,7 @@ from hdrqn_torchrl.envs.scripted import (
     play_episodes,
     scripted_ceiling,
 )
-from hdrqn_torchrl.envs.task import Task, task_of
+from hdrqn_torchrl.envs.task import Task, goals_in_order, task_of
 
 __all__ = [
     "EgocentricSearch",
@@ -22,6 +22,7 @@ __all__ = [
     "Task",
     "UniformRandom",
     "ceiling",
+    "goals_in_order",
     "make_montezuma",
     "play_episodes",
     "scripted_ceiling",
