@@ -7,7 +7,8 @@
     episodes        episodes to play, rounded up to a multiple of num_envs (1000)
     num_envs        worlds that are played at the same time (250)
     seed            of the worlds (default: that of the run's own summary, evaluation.seed + 1). With the same seed,
-                    num_envs and env.KEY episode i begins in the same world for every agent
+                    num_envs and env.KEY episode i begins in the same world for every agent. The best checkpoint was
+                    chosen in the worlds of evaluation.seed itself: there it looks better than it is
     max_steps       steps after which an episode is cut off, if it has not ended (the run's evaluation.max_steps)
     epsilon         probability of a random choice, at each level (0: greedy)
     env.KEY         setting of the task that shall differ from the run's, e.g. env.view=3 env.layout=four_rooms

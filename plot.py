@@ -24,7 +24,7 @@ log_x     true: logarithmic axis
 title     heading
 
 Runs of a group are aligned by linear interpolation and never extrapolated. A curve goes as far as half of them reach,
-and is dotted where not all do.
+and is dotted where not all do. A band holds at each position for itself, not for the curve as a whole.
 """
 
 from __future__ import annotations
@@ -202,6 +202,10 @@ def tell_about(label: str, entries: list[Entry], settings: Settings) -> None:
     seeds = Counter((task_key(entry), value_of(entry, "seed")) for entry in entries)
     if twice := [seed for (_, seed), number in seeds.items() if number > 1 and seed != "none"]:
         note(f"note: {label}: several runs with seed {', '.join(dict.fromkeys(twice))}; each counts as one")
+    counts = Counter(task for task, _ in seeds.elements())
+    if len(set(counts.values())) > 1:
+        fewest, most = min(counts.values()), max(counts.values())
+        note(f"note: {label}: tasks have {fewest} to {most} runs; each run counts alike, so tasks do not")
     if differing := differences(entries):
         note(f"note: {label} puts runs together that differ in {shortened(differing)}; by=... separates them")
 

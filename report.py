@@ -255,14 +255,15 @@ def table_row(label: str, members: list[Found]) -> str:
     columns = [f"greedy/{name}" for name in QUANTITIES]
     mean = {name: each.value[0] for name, each in estimate_finals(done, columns).items()}
     score = estimate_finals(done, columns[:1])[columns[0]]
-    iqm = estimate_finals(done, columns[:1], center="iqm")[columns[0]].value[0]
+    trimmed = estimate_finals(done, columns[:1], center="iqm")[columns[0]].value[0]
+    iqm = f"{trimmed:.2f}" if len(done) >= 4 else ""  # of fewer it is the mean
     interval = "" if score.low[0] != score.low[0] else f"{score.low[0]:.2f} to {score.high[0]:.2f}"
     ceiling = done[0].summary.get("ceiling")
     share = f"{mean[columns[0]] / ceiling:.0%}" if ceiling else ""
     frames = sum(run.summary["frames"] for run in done) / len(done)
     minutes = sum(run.summary["wall_seconds"] for run in done) / len(done) / 60
     cells = (
-        label, seeds, f"{mean[columns[0]]:.2f}", interval, f"{iqm:.2f}", share, f"{mean[columns[2]]:.0%}",
+        label, seeds, f"{mean[columns[0]]:.2f}", interval, iqm, share, f"{mean[columns[2]]:.0%}",
         f"{mean[columns[1]]:.0%}", f"{mean[columns[3]]:.1f}", f"{frames / 1000:.0f}k", f"{minutes:.0f} min", commits,
     )  # fmt: skip
     return "| " + " | ".join(cells) + " |"

@@ -39,8 +39,13 @@ LONGEST_EPISODE = 30_000
 class Observer(Protocol):
     """Something that counts what happens."""
 
-    def add_step(self, step: TensorDictBase) -> None:
-        """Takes one step of all environments ``[N]``, its outcome below ``"next"``."""
+    def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
+        """Takes one step of all environments ``[N]``, its outcome below ``"next"``.
+
+        Args:
+            step: of all environments.
+            counted: which of them count, ``[N]`` bool; ``None``: all.
+        """
         ...
 
 
@@ -63,12 +68,13 @@ class PlaceCounter:
         self.cell = cell
         self.counts = torch.zeros(-(-height // cell), -(-width // cell), dtype=torch.int64)
 
-    def add_step(self, step: TensorDictBase) -> None:
-        """Reads ``position`` after one step of all environments ``[N]``."""
+    def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
+        """Reads ``position`` after one step of all environments ``[N]``; see :class:`Observer`."""
         rows, columns = self.counts.shape
         x, y = (step.get(("next", keys.POSITION)).cpu() / self.cell).long().unbind(-1)
         index = y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)
-        self.counts.view(-1).index_add_(0, index, torch.ones_like(index))
+        weight = torch.ones_like(index) if counted is None else counted.cpu().long()
+        self.counts.view(-1).index_add_(0, index, weight)
 
 
 class EpisodeTracker:
@@ -164,7 +170,8 @@ def play(
         episodes: number of episodes, rounded up to a multiple of N.
         seed: of the first round; those of the others are derived from it.
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
-        observers: are shown every step, those after the end of an environment's last episode as well.
+        observers: are shown every step and told where it belongs to an episode that counts: environments that are done
+            with theirs go on, and short episodes would be seen too often.
         max_steps: episodes are cut off after so many steps, if they have not ended before; ``None``: not at all.
 
     Returns:
@@ -269,7 +276,7 @@ def _play_once(
         after = tensordict.get("next")
         sums = tracker.add(after)
         for observer in observers:
-            observer.add_step(tensordict)
+            observer.add_step(tensordict, playing)
         ended = playing & after.get(keys.DONE).squeeze(-1)
         episodes = sums if episodes is None else torch.where(ended, sums, episodes)
         playing, tensordict = playing & ~ended, following

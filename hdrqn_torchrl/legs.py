@@ -46,8 +46,13 @@ class LegCounter:
         for step in batch.unbind(1):
             self.add_step(step)
 
-    def add_step(self, step: TensorDictBase) -> None:
-        """Takes one step of all environments ``[N]``, its outcome below ``"next"``."""
+    def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
+        """Takes one step of all environments ``[N]``, its outcome below ``"next"``.
+
+        Args:
+            step: of all environments.
+            counted: in which of them options that end count, ``[N]`` bool; ``None``: in all.
+        """
         start, after = torch.tensor(self.num_subgoals), step.get("next")
         if self._place is None or self._origin is None:
             self._place = self._origin = start.expand(step.batch_size)
@@ -56,7 +61,8 @@ class LegCounter:
         self._origin = torch.where(step[keys.OPTION_INIT].squeeze(-1), place, self._origin)
         leg = self._origin * self.num_subgoals + after[keys.ACTIVE_SUBGOAL]
         for counts, happened in ((self.options, keys.OPTION_DONE), (self.reached, keys.SUBGOAL_REACHED)):
-            counts.view(-1).index_add_(0, leg, after[happened].squeeze(-1).long())
+            now = after[happened].squeeze(-1)
+            counts.view(-1).index_add_(0, leg, (now if counted is None else now & counted).long())
         attained = after[keys.ATTAINED]
         self._place = torch.where(attained.any(-1), attained.int().argmax(-1), place)
 

@@ -8,6 +8,7 @@ from user_envs import Corridor
 
 from hdrqn_torchrl.envs import Task, goals_in_order, task_of
 from hdrqn_torchrl.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round, summarise
+from hdrqn_torchrl.legs import LegCounter
 
 PAIR = ("####", "#  #", "####")  # agent and goal side by side
 TRACKED = ("return", "extrinsic", "intrinsic", "success", "in_order", "steps")
@@ -271,10 +272,9 @@ class TestIntervals:
         assert width(800) == pytest.approx(width(50) / 4, rel=0.3)
 
     def test_figures_that_never_differ_have_none(self):
-        env = pair_env(4, max_steps=1)
-        summary = summarise(play(env, always_right(), episodes=4, max_steps=1))
-        assert summary["intervals"]["cut_off_rate"][0] == 0.0
-        assert summary["intervals"]["steps_mean"] is None
+        """Between walls above and below nobody who goes up (0) moves."""
+        intervals = summarise(play(pair_env(4), always(0), episodes=8))["intervals"]
+        assert intervals["return_mean"] is None and intervals["steps_mean"] is None
 
     def test_one_episode_has_none_but_of_rates(self):
         intervals = summarise(play(pair_env(1), always_right(), episodes=1))["intervals"]
@@ -290,17 +290,30 @@ class TestIntervals:
         assert summarise(played)["intervals"]["success_rate"] == [pytest.approx(0.025 ** (1 / 100)), 1.0]
 
 
-def test_observers_see_every_step():
+def test_observers_see_every_step_and_know_those_of_episodes_that_count():
     class Steps:
-        count = 0
+        seen = counted = 0
 
-        def add_step(self, step):
-            self.count += step.numel()
+        def add_step(self, step, counted):
+            self.seen += step.numel()
+            self.counted += int(counted.sum())
             assert step["next", "done"].shape == (4, 1)
 
     steps = Steps()
-    play(pair_env(4), always_right(), episodes=8, observers=[steps])
-    assert steps.count >= 8 and steps.count % 4 == 0
+    played = play(pair_env(4), always_right(), episodes=40, observers=[steps])
+    assert steps.seen > steps.counted == played["steps"].sum()  # who was lucky at once went on beside the others
+
+
+def test_legs_are_those_of_the_episodes_that_are_reported():
+    torch.manual_seed(0)
+    env = small_env(16, max_steps=40)
+    algorithm = build("v2", env)
+    legs = LegCounter(num_subgoals=2)
+    random = {"exploration_type": ExplorationType.RANDOM}
+    played = play(algorithm.transform(env), algorithm.policy, episodes=32, observers=[legs], **random)
+    assert legs.options.sum(0).tolist() == played["chosen"].sum(0).tolist()
+    assert legs.reached.sum(0).tolist() == played["reached"].sum(0).tolist()
+    assert played["steps"].min() < 40  # some were done early
 
 
 def test_places_beyond_the_screen_count_at_its_edge():
@@ -308,3 +321,5 @@ def test_places_beyond_the_screen_count_at_its_edge():
     position = torch.tensor([[0.0, 0.0], [-3.0, 1.9], [99.0, 4.0], [3.0, 99.0]])
     places.add_step(TensorDict({"next": {"position": position}}, [4]))
     assert places.counts.tolist() == [[2, 0, 0], [0, 0, 0], [0, 1, 1]]
+    places.add_step(TensorDict({"next": {"position": position}}, [4]), torch.tensor([True, False, False, False]))
+    assert places.counts.tolist() == [[3, 0, 0], [0, 0, 0], [0, 1, 1]]

@@ -179,6 +179,9 @@ def test_pooled_tasks_share_only_the_ceilings_that_are_the_same(run, tmp_path, f
     assert returns == [2.0, -0.91] and steps == [12.1, 48.8]  # planner and random, which have no view
     last = [row for row in table() if row["metric"] == "behaviour/return"][-1]
     assert [last[name] for name in ("group", "estimate", "low", "high", "seeds")] == ["v2", "8", "", "", "4"]
+    make_run(tmp_path / "outputs/5-2", view=5, seed=2, offset=5)
+    _, err = run("runs=outputs", "out=table.csv", "pool=true", "columns=behaviour/return", "ceilings=none")
+    assert err == "note: v2: tasks have 2 to 3 runs; each run counts alike, so tasks do not\n"
 
 
 def test_an_unmeasured_task_shows_the_ceiling_that_was_logged(run, tmp_path, figures):

@@ -69,7 +69,7 @@ def test_figures_tables_and_claims_of_a_study(run, outputs):
     assert "`python train.py -m experiment=gridworld` (runs that have not been made to their end yet: 12 of 18)" in text
     row = next(line for line in text.splitlines() if line.startswith("| v2 |"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
-    expected = "v2", "0, 1", "1.60", "1.54 to 1.67", "1.60", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
+    expected = "v2", "0, 1", "1.60", "1.54 to 1.67", "", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
     assert tuple(cells) == expected
     assert "| hdqn | none finished |" in text
     assert "| v2 takes 22 steps (within 1.5) | open | v2 21 |" in text
