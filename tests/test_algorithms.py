@@ -168,6 +168,36 @@ class TestBoundsOfTargets:
         assert (loss.min_meta_target, loss.max_meta_target) == (-5.0, 20.0)
 
 
+class TestTasksWithoutEnd:
+    @pytest.mark.parametrize(
+        ("name", "options"),
+        [
+            ("hdqn", {}),
+            ("v1", {"repeatable_subgoals": True}),
+            ("v2", {"meta_hindsight": True, "refresh_hidden_steps": 6}),
+        ],
+        ids=str,
+    )
+    def test_the_meta_level_learns_from_what_happened_so_far(self, name, options):
+        env = Corridor(4, length=None)
+        algorithm = build(name, env, settings=tiny_settings(slice_len=2, capacity=100), max_option_steps=3, **options)
+        meta = algorithm.learners["meta"]
+        for batch in collect(algorithm, env, 10, batches=12):
+            meta.store(batch)
+            for _ in range(meta.updates_due()):
+                assert meta.update(meta.sample())["loss"].isfinite()
+            held = meta.extract.state_dict()["held"]
+            assert len(held) <= 4 * 8 * 2
+        assert len(meta.buffer) == 100 and meta.updates > 10
+        assert meta.buffer.storage[:]["is_init"].sum() <= 4
+
+    def test_episodes_of_usual_length_are_stored_whole_and_others_in_pieces(self):
+        held = [
+            build("v2", small_env(2, max_steps=steps)).learners["meta"].extract.max_held for steps in (50, 1000, 1001)
+        ]
+        assert held == [1000, 1000, 8 * 4]
+
+
 class TestOptions:
     """Each option changes something."""
 

@@ -418,7 +418,7 @@ class TestSettings:
     @pytest.mark.parametrize(
         ("name", "value", "message"),
         [
-            ("burn_in", 1.0, r"burn_in must lie in \[0, 1\), got 1.0; "),
+            ("burn_in", 1.0, r"burn_in must be in \[0, 1\), got 1.0; "),
             ("loss_function", "l1", "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
             ("precision", "fp16", "precision must be 'auto', 'fp32' or 'bf16', got 'fp16'; "),
             ("sampling", "rows", "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),

@@ -68,6 +68,7 @@ def make_drqn(
             prediction_weight=prediction_weight,
         ),
         num_envs=has.num_envs,
+        episode_len=has.task.max_steps,
     )
     return Algorithm(
         policy=policy,

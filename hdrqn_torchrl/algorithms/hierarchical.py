@@ -23,10 +23,14 @@ from hdrqn_torchrl.data import (
     refresh_hidden,
     relabel_subgoals,
 )
+from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learner import Extract, Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform, largest_intrinsic_return
+
+LONGEST_HELD_EPISODE = 1_000
+"""Steps of the longest episode whose options are stored all at once, when it is over."""
 
 
 def make_hdrqn(
@@ -195,6 +199,7 @@ def make_hdrqn(
             prediction_weight=prediction_weight,
         ),
         num_envs=has.num_envs,
+        episode_len=has.task.max_steps,
         refresh=relabel,
     )
     meta_learner = Learner(
@@ -207,6 +212,7 @@ def make_hdrqn(
             state_keys=stored_states(meta_controller, meta),
             history_steps=refresh_steps,
             hindsight_gamma=option_gamma if meta_hindsight else None,
+            max_held=_held_options(has.task, meta),
         ),
         loss=make_recurrent_loss(
             meta_controller,
@@ -220,6 +226,7 @@ def make_hdrqn(
                 "action_mask": mask_key,
             },
         ),
+        episode_len=has.task.max_steps,
         refresh=refresh,
     )
 
@@ -256,6 +263,7 @@ def _option_extract(
     state_keys: list[NestedKey],
     history_steps: int | None,
     hindsight_gamma: float | None,
+    max_held: int,
 ) -> Extract:
     """Where the meta level's transitions come from: options as they were or, given a discount, in hindsight, too."""
 
@@ -267,11 +275,23 @@ def _option_extract(
             at_end=at_end,
             state_keys=state_keys,
             history=None if history_steps is None else OptionHistory(history_steps),
+            max_held=max_held,
         )
 
     if hindsight_gamma is None:
         return extractor()
     return HindsightOptions(extractor(), extractor(keys.HINDSIGHT_SUBGOAL), gamma=hindsight_gamma, at_start=at_end)
+
+
+def _held_options(task: Task, meta: LearnerSettings) -> int:
+    """How many options of an episode wait for its end: all, unless it may be very long or have none.
+
+    What waits can't be learned from yet. Sequences don't go over the border between two pieces of an episode, so these
+    are several times as long.
+    """
+    if task.max_steps is not None and task.max_steps <= LONGEST_HELD_EPISODE:
+        return LONGEST_HELD_EPISODE
+    return 8 * (meta.slice_len + meta.lookahead())
 
 
 @torch.no_grad()

@@ -169,6 +169,7 @@ def make_v3(
         extract=stored,
         loss=loss,
         num_envs=has.num_envs,
+        episode_len=has.task.max_steps,
         separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
     )
 

@@ -19,8 +19,9 @@ class OptionExtractor:
 
     A transition pairs the step at which an option started with the one at which it ended, however many
     batches lie between them. Transitions come out by whole episodes, each in order and without gaps, once the
-    episode is over; so a replay buffer can hold them row by row. Batches must come from one collector, in
-    order, with the same N environments.
+    episode is over; so a replay buffer can hold them row by row. Of an episode that is very long or has no end, a piece
+    comes out now and then: each transition is as it would have been, but sequences do not go from one piece to the
+    next unless they lie side by side. Batches must come from one collector, in order, with the same N environments.
 
     Args:
         input_keys: what the meta-controller reads; kept from the start and, under ``"next"``, from the end.
@@ -35,6 +36,11 @@ class OptionExtractor:
         state_keys: kept from the start only: the meta-controller's LSTM state before it chose.
         history: keeps the observations of whole options in the transitions, so that
             :func:`~hdrqn_torchrl.data.refresh_hidden` can compute v2's inputs anew.
+        max_held: finished options of an unfinished episode that are held back, for each environment; if there are more,
+            they come out.
+
+    Raises:
+        ValueError: if ``max_held`` is less than 1.
 
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -65,7 +71,11 @@ class OptionExtractor:
         at_end: Callable[[TensorDictBase], TensorDictBase] | None = None,
         state_keys: Sequence[NestedKey] = (),
         history: OptionHistory | None = None,
+        max_held: int = 1_000,
     ) -> None:
+        if max_held < 1:
+            raise ValueError(f"max_held must be >= 1 option, got {max_held}; use some multiple of slice_len.")
+        self.max_held = max_held
         self.at_end, self.history = at_end, history
         self.init_key, self.traj_key, self.option_steps_key = init_key, traj_key, option_steps_key
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
@@ -81,11 +91,21 @@ class OptionExtractor:
         self._open_starts: TensorDictBase | None = None  # [N]: start of the option in progress
         self._is_open: Tensor | None = None  # [N]
         self._held: TensorDictBase | None = None  # [M]: finished options of unfinished episodes
+        self._last: TensorDictBase | None = None  # [N]: the last one that came out of an unfinished episode
         if self.history is not None:
             self.history.reset()
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase | None:
-        """Returns the options ``[M]`` of all episodes that ended in ``batch`` ``[N, T]``; ``None`` if none did."""
+        """Returns the options ``[M]`` of all episodes that ended in ``batch`` ``[N, T]``; ``None`` if none did.
+
+        Raises:
+            ValueError: if the batch is of another number of environments than the ones before.
+        """
+        if self._is_open is not None and len(self._is_open) != len(batch):
+            raise ValueError(
+                f"batch must hold the same {len(self._is_open)} environments as those before, got {len(batch)}; give "
+                "each memory the batches of one collector."
+            )
         starts = batch.select(*self._start_keys)
         started = batch.get(self.option_init_key).squeeze(-1)
         ended = batch.get(unravel_key(("next", self.option_done_key))).squeeze(-1)
@@ -131,29 +151,49 @@ class OptionExtractor:
         ends = torch.where(options.get(("next", keys.DONE)).squeeze(-1), rows, -1)
         last_end = rows.new_full((num_envs,), -1).scatter_reduce(0, environment, ends, "amax")
         complete = rows <= last_end[environment]
+        held = torch.zeros_like(last_end).scatter_add(0, environment, (~complete).long())
+        goes_on = held > self.max_held  # [N]
+        complete |= goes_on[environment]
         self._held = options[(~complete).nonzero().squeeze(-1)]
-        released = options[complete.nonzero().squeeze(-1)].exclude("environment")
+        released = options[complete.nonzero().squeeze(-1)]
         if self.history is not None:
-            self._look_back(released)
-        return released if len(released) else None
+            self._look_back(released, goes_on)
+        return released.exclude("environment") if len(released) else None
 
-    def _look_back(self, options: TensorDictBase) -> None:
+    def _look_back(self, options: TensorDictBase, goes_on: Tensor) -> None:
         """Gives each option the history of the one before it in its episode: what its first input comes from."""
-        traj = options.get(self.traj_key)
+        traj, environment = options.get(self.traj_key), options.get("environment")
         first = options.get(self.init_key).flatten() | (traj != traj.roll(1))  # or its predecessor is unknown
         first[:1] = True
-        for key in (HISTORY, HISTORY_SUBGOAL, HISTORY_STEPS):
+        names = (HISTORY, HISTORY_SUBGOAL, HISTORY_STEPS)
+        for key in names:
             before = options.get(("next", key)).roll(1, 0)
             options.set(key, before.masked_fill(first.view(-1, *[1] * (before.ndim - 1)), 0))
+        if self._last is not None:  # of an episode that goes on
+            before = self._last[environment]
+            known = first & ~options.get(self.init_key).flatten() & (before.get(self.traj_key) == traj)
+            known &= before.get("environment") == environment
+            for key in names:
+                options.get(key)[known] = before.get(("next", key))[known]
+        if goes_on.any():
+            rows = torch.arange(len(options), device=traj.device)
+            newest = rows.new_zeros(len(goes_on)).scatter_reduce(0, environment, rows, "amax")
+            last = options[newest].select("environment", self.traj_key, *(("next", key) for key in names))
+            if self._last is not None:
+                last = last.where(goes_on, self._last)
+            self._last = last
 
     def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""
-        state = {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
+        state: dict[str, Any] = {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
+        if self._last is not None:
+            state["last"] = self._last
         return state if self.history is None else {**state, "history": self.history.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._open_starts, self._is_open, self._held = state["open_starts"], state["is_open"], state["held"]
+        self._last = state.get("last")
         if self.history is not None:
             self.history.load_state_dict(state["history"])
 

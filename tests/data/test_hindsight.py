@@ -246,7 +246,7 @@ class TestSubLearner:
     def test_a_minibatch_holds_every_subgoal(self, name, settings):
         learner = self.learner(name, **settings)
         sample = learner.sample()
-        assert sample.shape == (32, settings.get("slice_len", 4))
+        assert sample.shape == (32, settings.get("slice_len", 4) + learner.settings.lookahead())
         assert (sample["subgoal"][16:, 0] == 1 - sample["subgoal"][:16, 0]).all()
         assert learner.update(sample)["loss"] > 0
 

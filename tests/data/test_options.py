@@ -1,8 +1,11 @@
+from copy import deepcopy
+
 import pytest
 import torch
 from helpers import batches_of, random_play
+from tensordict import TensorDict
 
-from hdrqn_torchrl.data import OptionExtractor, StepSelector
+from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector
 
 SHAPES = [(1, 2), (3, 2), (3, 3), (6, 17), (5, 1), (1, 17)]
 
@@ -73,6 +76,106 @@ class TestAgainstPlainLoops:
             successor.load_state_dict(extractor.state_dict())
             extractor = successor
             assert_same(extractor(batch), plain(batch))
+
+
+def endless(num_envs, length, *, mean_episode=None, seed=0):
+    """Steps ``[N, length]`` with options of one to four steps; episodes end at random, or never."""
+    generator = torch.Generator().manual_seed(seed)
+    rows = []
+    for n in range(num_envs):
+        episode, left, age = 0, 0, 0
+        for t in range(length):
+            starts = left == 0
+            left = int(torch.randint(1, 5, (), generator=generator)) if starts else left
+            age = age + 1 if not starts else 1
+            last = mean_episode is not None and float(torch.rand((), generator=generator)) < 1 / mean_episode
+            left = 0 if last else left - 1
+            first = t == 0 or bool(rows[-1][5])
+            rows.append([1_000 * n + t, 10_000 * n + episode, first, starts, left == 0, last, age])
+            episode += last
+    observation, traj, init, option_init, option_done, done, age = (
+        torch.tensor(rows).view(num_envs, length, -1).unbind(-1)
+    )
+    td = TensorDict(observation=observation, batch_size=[num_envs, length])
+    td["is_init"], td["option_init"] = init.bool().unsqueeze(-1), option_init.bool().unsqueeze(-1)
+    td["collector", "traj_ids"] = traj
+    td["next"] = TensorDict(observation=observation + 1, active_subgoal=observation % 3, batch_size=[num_envs, length])
+    done = done.bool().unsqueeze(-1)
+    td["next"].update({"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)})
+    td["next", "option_done"] = option_done.bool().unsqueeze(-1)
+    td["next", "option_steps"] = age.unsqueeze(-1)
+    td["next", "option_return"] = torch.rand(num_envs, length, 1, generator=generator)
+    return td
+
+
+class TestEpisodesWithoutEnd:
+    @pytest.mark.parametrize("mean_episode", [None, 40, 6])
+    @pytest.mark.parametrize(("num_envs", "length", "max_held"), [(1, 3, 1), (3, 7, 4), (4, 50, 3), (2, 1, 9)])
+    def test_their_options_come_out_in_pieces_each_once_in_order(self, num_envs, length, max_held, mean_episode):
+        steps = endless(num_envs, 200, mean_episode=mean_episode)
+        settings = {"input_keys": ["observation"], "mask_key": None}
+        pieces, whole = OptionExtractor(max_held=max_held, **settings), OptionExtractor(max_held=10_000, **settings)
+        taken, expected = [], []
+        for batch in batches_of(steps, length):
+            taken += [options for options in [pieces(batch)] if options is not None]
+            expected += [options for options in [whole(batch)] if options is not None]
+            held = pieces.state_dict()["held"]["observation"] // 1_000
+            assert held.bincount(minlength=num_envs).max() <= max_held
+        taken = torch.cat([*taken, pieces.state_dict()["held"].exclude("environment")])
+        expected = torch.cat([*expected, whole.state_dict()["held"].exclude("environment")])
+        assert len(expected) > 40 * num_envs
+        by_start = [options[options["observation"].argsort()] for options in (taken, expected)]
+        assert (by_start[0] == by_start[1]).all()  # the same transitions
+        for n in range(num_envs):
+            own = taken["observation"][taken["observation"] // 1_000 == n]
+            assert (own[1:] > own[:-1]).all()
+        same = taken["collector", "traj_ids"][1:] == taken["collector", "traj_ids"][:-1]
+        assert (taken["observation"][1:] == taken["next", "observation"][:-1])[
+            same
+        ].all()  # neighbours follow each other
+        starts = steps["observation"][steps["is_init"].squeeze(-1)]
+        assert (taken["is_init"].squeeze(-1) == torch.isin(taken["observation"], starts)).all()
+
+    def test_a_short_episode_comes_out_whole_whatever_the_limit_of_others(self):
+        steps = endless(2, 200, mean_episode=6)
+        usual, limited = (OptionExtractor(input_keys=["observation"], mask_key=None, max_held=m) for m in (1_000, 30))
+        for batch in batches_of(steps, 5):
+            first, second = usual(batch), limited(batch)
+            assert (first is None) == (second is None) and (first is None or (first == second).all())
+
+    @pytest.mark.parametrize("carry", [False, True], ids=["", "through its state"])
+    def test_a_piece_knows_the_history_of_the_option_before_it(self, carry):
+        steps, taken = endless(3, 200, mean_episode=60), {}
+        for max_held in (2, 10_000):
+            settings = {"input_keys": ["observation"], "mask_key": None, "max_held": max_held}
+            extractor = OptionExtractor(**settings, history=OptionHistory(5))
+            found = []
+            for batch in batches_of(steps, 4):
+                found += [options for options in [extractor(batch)] if options is not None]
+                if carry:
+                    state = deepcopy(extractor.state_dict())
+                    extractor = OptionExtractor(**settings, history=OptionHistory(5))
+                    extractor.load_state_dict(state)
+            taken[max_held] = torch.cat(found)
+        pieces, whole = taken[2], taken[10_000]
+        pieces = pieces[torch.isin(pieces["observation"], whole["observation"])]
+        pieces, whole = (options[options["observation"].argsort()] for options in (pieces, whole))
+        for part, wanted in ((pieces, whole), (pieces["next"], whole["next"])):
+            length = wanted["history_steps"]
+            assert (part["history_steps"] == length).all() and (length > 0).float().mean() > 0.8
+            assert (part["history_subgoal"] == wanted["history_subgoal"])[length.squeeze(-1) > 0].all()
+            seen = torch.arange(6) <= length
+            assert (part["history"] == wanted["history"])[seen & (length > 0)].all()
+
+    def test_other_environments_than_before_are_refused(self):
+        extractor = OptionExtractor(input_keys=["observation"], mask_key=None)
+        extractor(endless(3, 5))
+        with pytest.raises(ValueError, match="batch must hold the same 3 environments as those before, got 2; give"):
+            extractor(endless(2, 5))
+
+    def test_the_limit_must_be_positive(self):
+        with pytest.raises(ValueError, match="max_held must be >= 1 option, got 0; "):
+            OptionExtractor(max_held=0)
 
 
 class TestOptions:
