@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hdrqn_torchrl.intervals import CONFIDENCE, center_interval
-from hdrqn_torchrl.results import Array, References, Run, asks_for_a_time, curve, final_value
+from hdrqn_torchrl.results import Array, References, Run, asks_for_a_time, curve, final_value, is_share
 
 Center = Literal["mean", "iqm"]
 _CUT = {"mean": 0.0, "iqm": 0.25}
@@ -169,7 +169,7 @@ def estimate_curves(
     for column in columns:
         curves = [curve(run, column, axis=axis, smooth=smooth) for run in runs]
         if any(len(x) for x, _ in curves):
-            estimates[column] = estimate(*align(curves), strata=strata, center=center)
+            estimates[column] = _possible(column, estimate(*align(curves), strata=strata, center=center))
     return estimates
 
 
@@ -189,8 +189,13 @@ def estimate_finals(
             if asks_for_a_time(column) and not np.isfinite(values).all():
                 none = np.full(1, np.nan)
                 each = replace(each, value=none, low=none, high=none)
-            estimates[column] = each
+            estimates[column] = _possible(column, each)
     return estimates
+
+
+def _possible(column: str, each: Estimate) -> Estimate:
+    """An estimate whose interval ends where the means of a column do."""
+    return replace(each, low=each.low.clip(min=0), high=each.high.clip(max=1)) if is_share(column) else each
 
 
 def write_table(path: Path, tasks: Iterable[TaskResults], *, axis: str) -> None:

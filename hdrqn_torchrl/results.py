@@ -19,6 +19,7 @@ References = dict[str, dict[str, float]]
 Array = NDArray[np.floating[Any]]
 
 METRICS_FILE = "metrics.csv"
+_SHARES = ("success", "in_order")
 _UNTIL = re.compile(r"(?P<axis>frames|episodes|updates|wall_seconds) until (?P<column>\S+) *>= *(?P<level>-?[\d.]+)")
 
 
@@ -157,6 +158,16 @@ def source_of(column: str) -> str:
     """The column that a final value is read from; ``column`` itself, unless that asks for a time."""
     asked = _UNTIL.fullmatch(column)
     return asked["column"] if asked else column
+
+
+def is_share(column: str) -> bool:
+    """Whether a column's values lie between 0 and 1.
+
+    Examples:
+        >>> is_share("greedy/success"), is_share("greedy/return")
+        (True, False)
+    """
+    return column.rpartition("/")[2] in _SHARES
 
 
 def asks_for_a_time(column: str) -> bool:

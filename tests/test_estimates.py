@@ -174,6 +174,16 @@ def test_a_time_is_estimated_only_if_every_run_got_there():
     assert with_one_missing.samples.ravel() == pytest.approx([10, 20, NAN], nan_ok=True)
 
 
+def test_intervals_of_shares_end_at_0_and_1():
+    values = [[0, 0.8], [0.2, 1]]
+    runs = [run_of(frames=[0, 1], greedy__success=each, loss=each) for each in values]
+    columns = ["greedy/success", "loss"]
+    for estimates in (estimate_curves(runs, columns), estimate_finals(runs, columns)):
+        share, loss = (estimates[name] for name in columns)
+        assert share.low.min() >= 0 and share.high.max() == 1
+        assert loss.low.min() < 0 and loss.high.max() > 1 and (share.value == loss.value).all()
+
+
 def test_the_table_has_a_row_for_each_estimate(tmp_path):
     runs = [run_of(frames=[0, 10, 20], loss=[0.5, 1, 2]), run_of(frames=[0, 10], loss=[1.5, 1])]
     group = Group("v2, view=3", runs, estimate_curves([*runs, run_of(frames=[0], loss=[1])], ["loss"]))

@@ -1,6 +1,7 @@
 import json
 import re
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -237,3 +238,22 @@ class TestStudies:
         assert is_run_of(job, {"seed": 0, "algo.gamma": 0.9})  # it is older than tau
         assert not is_run_of(job, settings | {"algo.gamma": 0.8})
         assert not is_run_of(job, settings | {"algo.other": 1})
+
+
+@pytest.mark.slow
+def test_the_kept_runs_are_still_those_of_their_study():
+    """Settings that were renamed or left to the task since they were made must not make strangers of them."""
+    with ExitStack() as stack:
+        kept = report.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
+        found, missing = report.runs_of_jobs("gridworld", "small", kept)
+    assert (len(found), missing) == (18, 0)
+    assert len({run.entry.run.folder for _, run in found}) == 18
+
+
+def test_a_bound_that_a_job_leaves_to_the_task_is_not_asked_for():
+    job = Job({}, {"algo.sub.max_target": None, "algo.gamma": 0.9})
+    assert is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.9})
+    assert not is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.99})
+    unbounded = Job({}, {"algo.sub.max_target": float("inf")})
+    assert not is_run_of(unbounded, {"algo.sub.max_target": 1.0})
+    assert not is_run_of(Job({}, {}), {"algo.sub.max_target": 1.0})

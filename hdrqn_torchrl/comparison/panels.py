@@ -17,7 +17,7 @@ from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
 from hdrqn_torchrl.estimates import Center, Estimate, Group, TaskResults
-from hdrqn_torchrl.results import Array
+from hdrqn_torchrl.results import Array, is_share
 
 
 class Panel(NamedTuple):
@@ -47,7 +47,6 @@ _QUANTITIES = {  # by the last part of a column's name
     "success": "success (all goals in order)",
     "in_order": "goals reached in order",
 }
-_SHARES = ("success", "in_order")
 _REFERENCE_KEYS = {"return": "return_mean", "steps": "steps_mean", "success": "success_rate"}
 
 # Okabe and Ito's palette: told apart by colour-blind readers, too. Its yellow is too light for lines.
@@ -141,7 +140,7 @@ def finish_panel(place: Axes, panel: Panel, lying: bool = False) -> None:
     known = source in ("behaviour", "greedy") and name in _QUANTITIES
     values = place.xaxis if lying else place.yaxis
     values.set_label_text(panel.label or (_QUANTITIES[name] if known else panel.column))
-    if known and name in _SHARES:
+    if known and is_share(name):
         (place.set_xlim if lying else place.set_ylim)(-0.03, 1.05)
         values.set_major_formatter(PercentFormatter(1.0))
     place.grid(alpha=0.25, linewidth=0.6)
