@@ -69,6 +69,7 @@ class CheckpointSchema:
     interval_frames: int = MISSING
     interval_minutes: float = MISSING
     keep_last: int = MISSING
+    replay: Any = True  # or False, or "last"
 
 
 @dataclass
@@ -143,6 +144,11 @@ def check(config: DictConfig) -> None:
     if config.device not in ("auto", "cpu", "cuda"):
         raise SettingsError(
             f"device must be auto, cpu or cuda, got {config.device!r}; auto takes a GPU if there is one."
+        )
+    replay = config.checkpoint.replay
+    if replay not in (True, False, "last"):
+        raise SettingsError(
+            f"checkpoint.replay must be true, false or last, got {shown(replay)}; true goes on exactly."
         )
     loggers = OmegaConf.select(config, "logger.loggers")
     if not isinstance(loggers, ListConfig):

@@ -218,7 +218,9 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
         total_frames=config.total_frames,
         log_frames=config.log_frames,
         evaluation_frames=config.evaluation.interval_frames,
-        checkpoints=Checkpoints(run.folder / "checkpoints", keep_last=config.checkpoint.keep_last),
+        checkpoints=Checkpoints(
+            run.folder / "checkpoints", keep_last=config.checkpoint.keep_last, replay=config.checkpoint.replay
+        ),
         checkpoint_frames=config.checkpoint.interval_frames,
         checkpoint_seconds=60.0 * config.checkpoint.interval_minutes,
         ceiling=ceiling_of(references),

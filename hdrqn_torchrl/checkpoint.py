@@ -16,7 +16,7 @@ import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError
@@ -27,7 +27,8 @@ from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 from hdrqn_torchrl.serialization import SafetensorsAdapter
 
 CHECKSUMS = "checksums.json"
-PREFIX, SCORE = "checkpoint-", "greedy_return"
+PREFIX, SCORE, MEMORY = "checkpoint-", "greedy_return", "memory-"
+Replay = bool | Literal["last"]
 _UNSCORED = -sys.float_info.max  # the rotation wants a finite number; this one is never the best
 
 
@@ -46,10 +47,7 @@ class DurableCheckpoint(Checkpoint):
     @staticmethod
     def _publish_path(source: Path, destination: Path) -> None:
         files = sorted(path for path in source.rglob("*") if path.is_file())
-        sums = {path.relative_to(source).as_posix(): _checksum(path) for path in files}
-        (source / CHECKSUMS).write_text(json.dumps(sums))
-        for path in (source, *source.rglob("*")):
-            _sync(path)
+        _seal(source, {path.relative_to(source).as_posix(): _checksum(path) for path in files})
         Checkpoint._publish_path(source, destination)
         _sync(destination.parent)
 
@@ -60,24 +58,28 @@ class Checkpoints:
     Args:
         directory: where they lie; created with the first save.
         keep_last: how many of the newest are kept, beside the best by greedy return.
+        replay: which of them keep components named ``memory-...``, by far the largest: all (``True``), none (``False``)
+            or ``"last"``, the newest alone.
 
     Raises:
-        ValueError: if ``keep_last`` is less than 2.
+        ValueError: if an argument breaks its rule.
 
     Examples:
         >>> import tempfile
         >>> checkpoints = Checkpoints(Path(tempfile.mkdtemp()))
         >>> source, target = torch.nn.Linear(2, 1), torch.nn.Linear(2, 1)
         >>> path = checkpoints.save({"policy": source}, step=100)
-        >>> checkpoints.load({"policy": target}, path)
+        >>> _ = checkpoints.load({"policy": target}, path)
         >>> bool((source.weight == target.weight).all())
         True
     """
 
-    def __init__(self, directory: Path, *, keep_last: int = 2) -> None:
+    def __init__(self, directory: Path, *, keep_last: int = 2, replay: Replay = True) -> None:
         if keep_last < 2:
             raise ValueError(f"keep_last must be >= 2, got {keep_last}; one must stay while the newest is replaced.")
-        self.directory = directory
+        if replay not in (True, False, "last"):
+            raise ValueError(f"replay must be True, False or 'last', got {replay!r}; True resumes bit for bit.")
+        self.directory, self.replay = directory, replay
         self._rotation = CheckpointRotation(directory, keep_last=keep_last, keep_best=(SCORE, "max"))
 
     def save(self, components: Mapping[str, Any], *, step: int, score: float | None = None) -> Path:
@@ -93,7 +95,12 @@ class Checkpoints:
         """
         try:
             metadata = {SCORE: _UNSCORED if score is None else score}
-            return self._rotation.save(DurableCheckpoint(**components), step=step, metadata=metadata)
+            kept = {name: each for name, each in components.items() if self.replay or not name.startswith(MEMORY)}
+            path = self._rotation.save(DurableCheckpoint(**kept), step=step, metadata=metadata)
+            for earlier in self._paths():
+                if self.replay == "last" and earlier != path:
+                    _forget_memories(earlier)
+            return path
         except (OSError, SafetensorError) as error:
             raise CheckpointError(
                 f"the checkpoint at step {step} can't be written to {self.directory} ({error}); {self.last_good()}. "
@@ -105,15 +112,23 @@ class Checkpoints:
         whole = next(self._whole(), None)
         return f"the last good checkpoint is {whole}" if whole else "there is no earlier checkpoint"
 
-    def load(self, components: Mapping[str, Any], path: Path, device: torch.device | str = "cpu") -> None:
+    def load(self, components: Mapping[str, Any], path: Path, device: torch.device | str = "cpu") -> list[str]:
         """Restores components from the checkpoint ``path`` after checking all of it.
+
+        Those named ``memory-...`` are left alone if it was saved without them.
+
+        Returns:
+            Names of the components that were left alone.
 
         Raises:
             CheckpointError: if the checkpoint is not whole, or does not fit the components.
         """
         verify(path)
         try:
-            DurableCheckpoint(**components).load(path, map_location=device)
+            stored = Checkpoint.manifest(path)["components"]
+            wanted = {name: each for name, each in components.items() if name in stored or not name.startswith(MEMORY)}
+            DurableCheckpoint(**wanted).load(path, map_location=device)
+            return [name for name in components if name not in wanted]
         except CheckpointError as error:
             raise CheckpointError(
                 f"{path} does not fit; it must be loaded with the settings that it was made with.\n{error}"
@@ -168,6 +183,34 @@ class Checkpoints:
                 orphan.rename(self.directory / name)  # killed between the two renames of a replacement
             else:
                 _remove(orphan)
+
+
+def _forget_memories(path: Path) -> None:
+    """Replaces a checkpoint by one without its memories; a kill leaves what :meth:`Checkpoints.clean_up` mends."""
+    try:
+        manifest, sums = Checkpoint.manifest(path), json.loads((path / CHECKSUMS).read_text())
+        memories = [name for name in manifest["components"] if name.startswith(MEMORY)]
+        places = [manifest["components"].pop(name)["path"] for name in memories]
+    except (CheckpointError, ValueError, TypeError, KeyError, AttributeError):
+        return  # it is damaged, and stays as it is
+    if not places:
+        return
+    stage, backup = (path.with_name(f".{path.name}.{kind}-0") for kind in ("stage", "backup"))
+    shutil.copytree(path, stage, ignore=shutil.ignore_patterns(*(Path(place).name for place in places)))
+    (stage / "manifest.json").write_text(json.dumps(manifest))
+    kept = {name: each for name, each in sums.items() if not name.startswith(tuple(f"{place}/" for place in places))}
+    _seal(stage, kept | {"manifest.json": _checksum(stage / "manifest.json")})  # of the others as they were written
+    path.rename(backup)
+    stage.rename(path)
+    _sync(path.parent)
+    _remove(backup)
+
+
+def _seal(stage: Path, sums: Mapping[str, list[int]]) -> None:
+    """Adds the checksums, and writes everything to the disk."""
+    (stage / CHECKSUMS).write_text(json.dumps(sums))
+    for path in (stage, *stage.rglob("*")):
+        _sync(path)
 
 
 def _remove(path: Path) -> None:

@@ -352,23 +352,35 @@ class Learner:
         """
         self.guard.check()
 
-    def state_dict(self) -> dict[str, Any]:
-        """All that learning depends on: both networks, optimiser, replay memory, counters."""
+    def state_dict(self, *, memory: bool = True) -> dict[str, Any]:
+        """All that learning depends on: both networks, optimiser, replay memory, counters.
+
+        Args:
+            memory: whether to include what :meth:`memory_state_dict` returns.
+        """
         self.check_finite()
-        return {
+        rest = {
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
-            "buffer": self.buffer.state_dict(),
             "extract": self.extract.state_dict(),
-            "drawn": self._drawn,
             "updates": self.updates,
             "frames": self.frames,
             "warm_at": self._warm_at,
             "precision": self.precision,
         }
+        return rest | self.memory_state_dict() if memory else rest
+
+    def memory_state_dict(self) -> dict[str, Any]:
+        """The replay memory, the minibatches drawn from it and when it is warm: large, and the rest goes without."""
+        return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self._warm_at}
+
+    def load_memory_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`memory_state_dict` returned."""
+        self.buffer.load_state_dict(state["buffer"])
+        self._drawn, self._warm_at = list(state["drawn"]), state["warm_at"]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned.
+        """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up anew.
 
         Raises:
             ValueError: if it can't be what a learner of these settings returned.
@@ -376,10 +388,15 @@ class Learner:
         self._check_counters(state)
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
-        self.buffer.load_state_dict(state["buffer"])
         self.extract.load_state_dict(state["extract"])
-        self._drawn = list(state["drawn"])
-        self.updates, self.frames, self._warm_at = state["updates"], state["frames"], state["warm_at"]
+        self.updates, self.frames = state["updates"], state["frames"]
+        if "buffer" in state:
+            self.load_memory_state_dict(state)
+        else:
+            if len(self.buffer):
+                self.buffer.empty()
+            done = math.ceil(self.updates * self.settings.frames_per_update)
+            self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)
         if self.settings.precision == "auto":  # another machine might choose another one
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
 

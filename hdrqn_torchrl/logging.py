@@ -140,6 +140,10 @@ class RunLogger:
         if evaluated and not self.console.is_terminal:
             self.console.print(f"{self.label}{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
 
+    def say(self, sentence: str) -> None:
+        """Prints a line above the progress bar."""
+        self.console.print(f"{self.label}{sentence}", highlight=False, soft_wrap=True, markup=False)
+
     def state_dict(self) -> dict[str, Any]:
         """Its position in the files."""
         return {"csv": self.csv.state_dict(), "last_greedy": self._last_greedy}

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.checkpoint import Checkpoints
+from hdrqn_torchrl.checkpoint import MEMORY, Checkpoints
 from hdrqn_torchrl.evaluation import EpisodeTracker
 from hdrqn_torchrl.finite import NonFiniteError
 from hdrqn_torchrl.interruption import Interrupted, StopRequest
+from hdrqn_torchrl.learner import Learner
 from hdrqn_torchrl.logging import Row, RunLogger
 
 
@@ -208,10 +210,15 @@ class Trainer:
         """
         assert self.checkpoints is not None
         device = next(self.algorithm.policy.parameters()).device
-        self.checkpoints.load(self._components(), path, device=device)
+        missing = self.checkpoints.load(self._components(), path, device=device)
         self.checkpoints.go_back_to(self.frames)
         self.collector.update_policy_weights_()
         self._saved_at, self._saved_position = time.monotonic(), self._position
+        if missing and not any(len(learner.buffer) for learner in self.algorithm.learners.values()):
+            self.logger.say(
+                f"{path.name} holds no replay memory: it begins empty and is warmed up anew, so that the training goes "
+                "on, but not bit for bit as it would have"
+            )
 
     @property
     def _position(self) -> tuple[int, int, int | None]:
@@ -221,7 +228,8 @@ class Trainer:
         """All that a training consists of. They are restored in the order of their names."""
         return {
             "collector": self.collector,
-            **{f"learner-{name}": learner for name, learner in self.algorithm.learners.items()},
+            **{f"learner-{name}": _but_memory(learner) for name, learner in self.algorithm.learners.items()},
+            **{f"{MEMORY}{name}": _memory(learner) for name, learner in self.algorithm.learners.items()},
             "logger": self.logger,
             **({} if self.algorithm.phases is None else {"phases": self.algorithm.phases}),
             "policy": self.algorithm.policy,
@@ -248,6 +256,21 @@ class Trainer:
         self._started = time.monotonic() - state["wall_seconds"]
         self._tracker.load_state_dict(state["tracker"])
         self._window.load_state_dict(state["window"])
+
+
+class _Part:
+    """A component by its two methods."""
+
+    def __init__(self, save: Callable[[], dict[str, Any]], load: Callable[[dict[str, Any]], None]) -> None:
+        self.state_dict, self.load_state_dict = save, load
+
+
+def _but_memory(learner: Learner) -> _Part:
+    return _Part(partial(learner.state_dict, memory=False), learner.load_state_dict)
+
+
+def _memory(learner: Learner) -> _Part:
+    return _Part(learner.memory_state_dict, learner.load_memory_state_dict)
 
 
 def crossed(before: int, after: int, interval: int) -> bool:

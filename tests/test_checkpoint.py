@@ -179,6 +179,81 @@ class TestRetention:
         assert {path.name for path in tmp_path.iterdir()} == {"checkpoint-000000000020", *names}
 
 
+class TestMemories:
+    """Components whose names begin with "memory-"."""
+
+    def save(self, folder, replay, steps=(10, 20, 30)):
+        checkpoints = Checkpoints(folder, replay=replay)
+        for step in steps:
+            checkpoints.save({"part": State(step), "memory-a": State(step), "memory-b": State(step)}, step=step)
+        return checkpoints
+
+    def load(self, checkpoints, step):
+        parts = {name: State() for name in ("part", "memory-a", "memory-b")}
+        missing = checkpoints.load(parts, checkpoints.directory / f"checkpoint-{step:012d}")
+        return [part.state for part in parts.values()], missing
+
+    @pytest.mark.parametrize(
+        ("replay", "newest", "before"),
+        [(True, [30, 30, 30], [20, 20, 20]), ("last", [30, 30, 30], [20, None, None]), (False, [30, None, None], None)],
+    )
+    def test_which_checkpoints_hold_them(self, tmp_path, replay, newest, before):
+        checkpoints = self.save(tmp_path, replay)
+        assert sorted(path.name[-2:] for path in tmp_path.iterdir()) == ["20", "30"]
+        for step, expected in ((30, newest), (20, before or [20, None, None])):
+            verify(tmp_path / f"checkpoint-{step:012d}")
+            states, missing = self.load(checkpoints, step)
+            assert states == expected
+            assert missing == ([] if None not in expected else ["memory-a", "memory-b"])
+
+    def test_other_components_must_be_there(self, tmp_path):
+        checkpoints = self.save(tmp_path, True)
+        with pytest.raises(CheckpointError, match="does not fit"):
+            checkpoints.load({"other": State()}, checkpoints.newest())
+
+    def test_the_best_is_still_the_best_without_them(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path, replay="last")
+        for step, score in ((10, 0.5), (20, 0.1), (30, None), (40, None)):
+            checkpoints.save({"part": State(step), "memory-a": State(step)}, step=step, score=score)
+        assert checkpoints.best().name.endswith("10") and self.load(checkpoints, 10)[1] == ["memory-a", "memory-b"]
+
+    def test_damage_is_not_covered_up(self, tmp_path):
+        checkpoints = self.save(tmp_path, "last", steps=(10,))
+        (damaged,) = tmp_path.glob("*/components/*-part/structure.json")
+        damaged.write_text("20")
+        self.save(tmp_path, "last", steps=(20,))
+        with pytest.raises(CheckpointError, match="is damaged"):
+            self.load(checkpoints, 10)
+
+    @pytest.mark.parametrize("call", range(4))
+    def test_killed_on_the_way_both_checkpoints_are_whole(self, tmp_path, monkeypatch, call):
+        """Before the copy, before and between the renames, before what was replaced is removed."""
+        checkpoints = self.save(tmp_path, "last", steps=(10,))
+        calls = iter(range(9))
+
+        def dying(function):
+            def call_or_die(*args, **settings):
+                if next(calls) == call:
+                    raise KeyboardInterrupt
+                return function(*args, **settings)
+
+            return call_or_die
+
+        monkeypatch.setattr("hdrqn_torchrl.checkpoint.shutil.copytree", dying(shutil.copytree))
+        monkeypatch.setattr(Path, "rename", dying(Path.rename))
+        monkeypatch.setattr("hdrqn_torchrl.checkpoint._remove", dying(shutil.rmtree))
+        with pytest.raises(KeyboardInterrupt):
+            self.save(tmp_path, "last", steps=(20,))
+        monkeypatch.undo()
+        checkpoints.clean_up()
+        assert sorted(path.name[-2:] for path in tmp_path.iterdir()) == ["10", "20"]
+        assert self.load(checkpoints, 10)[0][0] == 10 and self.load(checkpoints, 20)[0] == [20, 20, 20]
+
+    def test_wrong_settings(self, tmp_path):
+        with pytest.raises(ValueError, match=r"replay must be True, False or 'last', got 'first'; "):
+            Checkpoints(tmp_path, replay="first")
+
+
 def make_folder(path, files=("manifest.json",)):
     path.mkdir(parents=True)
     for name in files:
@@ -258,7 +333,7 @@ class TestDamage:
         checkpoints, newest = saved
         before, backup = newest.with_name("checkpoint-000000000096"), newest.with_name("backup")
         names = files_of(newest)
-        assert len(names) == 2 + 2 * 7 and checkpoints.newest() == newest
+        assert len(names) == 2 + 2 * 9 and checkpoints.newest() == newest
         shutil.copytree(newest, backup)
         for name in names:
             DAMAGES[damage](newest / name)

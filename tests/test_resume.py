@@ -296,3 +296,26 @@ def test_one_that_had_ended_stays_as_it_is(training, tmp_path):
     shutil.copytree(folder / "uninterrupted", tmp_path, dirs_exist_ok=True)
     resume(build, tmp_path).train()
     check_same(tmp_path, folder / "uninterrupted")
+
+
+@pytest.mark.parametrize("training", ["v1-r2d2", "v2", "v3"], indirect=True)
+def test_one_without_its_memories_goes_on_with_empty_ones(training, tmp_path):
+    """Networks, optimisers, counters and worlds are as they were; updates wait for the warm-up, and are not made up."""
+    build, folder = training
+    shutil.copytree(folder / "with full memories", tmp_path, dirs_exist_ok=True)
+    trainer = resume(build, tmp_path, checkpoints=Checkpoints(tmp_path / "checkpoints", replay=False))
+    frames, updates, expected = trainer.frames, trainer.updates, trainer.algorithm.policy.state_dict()
+    expected = {key: value.clone() for key, value in expected.items()}
+    trainer._saved_position = None
+    trainer.save()
+    trainer = resume(build, tmp_path, total_frames=frames + 160)
+    assert "holds no replay memory: it begins empty and is warmed up anew" in trainer.logger.console.file.getvalue()
+    assert (trainer.frames, trainer.updates) == (frames, updates)
+    assert all((value == expected[key]).all() for key, value in trainer.algorithm.policy.state_dict().items())
+    made = {name: learner.updates for name, learner in trainer.algorithm.learners.items()}
+    for learner in trainer.algorithm.learners.values():
+        assert not len(learner.buffer) and not learner.updates_due()
+        assert learner._frames_owed == pytest.approx(-64, abs=8)  # warmup_frames
+    trainer.train()
+    for name, learner in trainer.algorithm.learners.items():
+        assert 0 < learner.updates - made[name] <= (160 - 64) / 8 + 1
