@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
-import numpy
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
+
+from hdrqn_torchrl.devices import own_random_numbers
 
 
 @contextmanager
@@ -19,8 +19,8 @@ def isolated(
 ) -> Iterator[None]:
     """Seeds an environment and everything random; afterwards all of it but the environment is as it was before.
 
-    That is: the random numbers of torch (on the CPU and on the devices of environment and policy), numpy and Python;
-    the policy's buffers, and which of its modules are in training mode. Inside, none is.
+    That is: the random numbers of torch (on the CPU and on GPUs), numpy and Python; the policy's buffers, and which of
+    its modules are in training mode. Inside, none is.
 
     Args:
         env: to be played in. It must not be the one that a training collects from, whose episodes would be lost.
@@ -38,36 +38,9 @@ def isolated(
         >>> torch.equal(torch.get_rng_state(), before)
         True
     """
-    tensors = [*policy.parameters(), *policy.buffers()]
-    devices = {tensor.device for tensor in tensors} | ({env.device} if env.device is not None else set())
-    with set_exploration_type(exploration_type), _own_random_numbers(seed, devices), _untouched(policy):
+    with set_exploration_type(exploration_type), own_random_numbers(seed), _untouched(policy):
         env.set_seed(seed)
         yield
-
-
-@contextmanager
-def _own_random_numbers(seed: int, devices: Iterable[torch.device]) -> Iterator[None]:
-    """Random numbers from a seed, on these devices and on the host; then the streams go on where they were."""
-    generators = generators_of(devices)
-    states, of_python, of_numpy = [each.get_state() for each in generators], random.getstate(), numpy.random.get_state()
-    try:
-        for generator in generators:
-            generator.manual_seed(seed)
-        random.seed(seed)
-        numpy.random.seed(seed % 2**32)
-        yield
-    finally:
-        for generator, state in zip(generators, states, strict=True):
-            generator.set_state(state)
-        random.setstate(of_python)
-        numpy.random.set_state(of_numpy)
-
-
-def generators_of(devices: Iterable[torch.device]) -> list[torch.Generator]:
-    """Torch's own generators on the host and on GPUs. (``torch.manual_seed`` reseeds those of all GPUs there are.)"""
-    gpus = [device for device in devices if device.type == "cuda"]
-    indices = {torch.cuda.current_device() if device.index is None else device.index for device in gpus}
-    return [torch.default_generator, *(torch.cuda.default_generators[index] for index in sorted(indices))]
 
 
 @contextmanager

@@ -11,8 +11,9 @@ from torch import nn
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 
+from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.evaluation import evaluate
-from hdrqn_torchrl.isolation import generators_of, isolated
+from hdrqn_torchrl.isolation import isolated
 from hdrqn_torchrl.rendering import record_episodes
 
 INSIDE = {"seed": 3, "exploration_type": ExplorationType.RANDOM}
@@ -81,23 +82,21 @@ def test_inside_the_seed_decides_on_every_stream_and_modules_do_not_train():
     assert all(first != second for first, second in zip(found[1][:3], found[2][:3], strict=True))
 
 
-def test_generators_of_the_devices_in_use_and_no_other(monkeypatch):
-    gpus = [torch.Generator() for _ in range(3)]
-    monkeypatch.setattr(torch.cuda, "default_generators", gpus)
-    monkeypatch.setattr(torch.cuda, "current_device", lambda: 1)
-    cpu = torch.default_generator
-    assert generators_of([torch.device("cpu")]) == [cpu]
-    assert generators_of([torch.device("cuda"), torch.device("cuda:1")]) == [cpu, gpus[1]]
-    assert generators_of([torch.device("cuda:2"), torch.device("cuda:0")]) == [cpu, gpus[0], gpus[2]]
-
-
 def test_a_gpus_numbers_go_on_as_well(monkeypatch):
-    """A generator that stands for a GPU's."""
-    gpu = torch.Generator().manual_seed(7)
-    monkeypatch.setattr("hdrqn_torchrl.isolation.generators_of", lambda devices: [torch.default_generator, gpu])
-    state, inside = gpu.get_state(), []
+    """Generators that stand for those of two GPUs."""
+    gpus, inside = [torch.Generator().manual_seed(seed) for seed in (7, 8)], []
+    monkeypatch.setattr(torch.cuda, "default_generators", gpus)
+    state = [gpu.get_state() for gpu in gpus]
+    monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
     for _ in range(2):
         with isolated(small_env(2), build("v2", small_env(2)).policy, **INSIDE):
-            inside.append(torch.rand(3, generator=gpu).tolist())
-        assert torch.equal(gpu.get_state(), state)
-    assert inside[0] == inside[1] != torch.rand(3, generator=gpu).tolist()
+            inside.append([torch.rand(3, generator=gpu).tolist() for gpu in gpus])
+        assert all(torch.equal(gpu.get_state(), before) for gpu, before in zip(gpus, state, strict=True))
+    assert inside[0] == inside[1] != [torch.rand(3, generator=gpu).tolist() for gpu in gpus]
+
+
+def test_without_a_seed_the_numbers_go_on_inside():
+    torch.manual_seed(0)
+    with own_random_numbers():
+        inside = draw()
+    assert draw() == inside

@@ -18,6 +18,7 @@ from hdrqn_torchrl.modules import (
     RepeatingEpsilonGreedy,
     observation_predictor,
 )
+from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
 from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform
@@ -118,6 +119,9 @@ def make_v3(
     meta_rate = learner.learning_rate if meta_learning_rate is None else meta_learning_rate
     has = check_environment(env, architecture, builder="make_v3", subgoals=True)
     observation, num_actions, num_subgoals = has.observation, has.num_actions, has.num_subgoals
+    for name, size, usual in (("memory_size", memory_size, 128), ("head_size", head_size, 128)):
+        check_size(name, size, usual)
+    check_size("prediction_steps", prediction_steps, "4, or 0 for no prediction", least=0)
     predictor = None
     if prediction_steps:
         predictor = observation_predictor(observation, memory_size, num_actions, prediction_steps, width=head_size)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -15,6 +14,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.transforms import StepCounter, TransformedEnv
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import own_random_numbers
 
 InOrder = Callable[[TensorDictBase], Tensor]
 
@@ -93,7 +93,7 @@ def task_of(env: EnvBase) -> Task:
 
 def _task_of_worker(env: BatchedEnvBase) -> Task:
     """Asked of a new one: a worker process that lacks an attribute ends when it is asked for it."""
-    with torch.random.fork_rng(devices=[]):  # to look changes nothing
+    with own_random_numbers():  # to look changes nothing
         worker = env.create_env_fn[0](**env.create_env_kwargs[0])
     try:
         return task_of(worker)

@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
     AllSubgoalsPolicy,
@@ -133,3 +135,10 @@ class TestControllers:
         sub = SubController(self.network(2, 2, recurrent=False))
         with pytest.raises(ValueError, match="read_last_observation must be False without recurrence"):
             HierarchicalPolicy(MetaController(self.network()), sub, read_last_observation=True)
+
+
+@pytest.mark.parametrize("name", ["memory_size", "head_size", "prediction_steps"])
+def test_a_builder_names_its_own_arguments(name):
+    env = MultiGoalGridEnv(num_envs=2)
+    with pytest.raises(ValueError, match=rf"^{name} must be >= [01], got -1; "):
+        make_v3(env, compact_network(4, (4,)), **{name: -1})
