@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torchrl.objectives import LossModule, SoftUpdate
 
-from hdrqn_torchrl.data import FROM_STARTS, Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data import FROM_STARTS, Continuity, Sampling, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.finite import FiniteGuard
 from hdrqn_torchrl.objectives import check_returns, target_lookahead
 from hdrqn_torchrl.precision import Precision, choose_precision, matrix_products
@@ -227,6 +227,7 @@ class Learner:
             importance_exponent=settings.importance_exponent,
             device=self.device,
         )
+        self._continuity = Continuity()
         self._drawn: list[TensorDictBase] = []
         self.held = False
         """Whether it stores only; what it could have learned meanwhile is not made up for."""
@@ -248,15 +249,12 @@ class Learner:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``.
 
         Raises:
-            ValueError: if the batch is not of the environments that the memory was built for.
+            ValueError: if the batch is not of the environments that the memory was built for, or does not go on where
+                the last one ended (:class:`~hdrqn_torchrl.data.Continuity`).
             NonFiniteError: as :meth:`check_finite`.
         """
         self.check_finite()
-        if batch.ndim != 2:
-            raise ValueError(
-                f"batch must have the shape [N, T] of N environments and T steps, got {list(batch.shape)}; collect "
-                "from one batch of environments."
-            )
+        self._continuity.check(batch)
         self.frames += batch.numel()
         self._drawn = []
         self._set_learning_rate()
@@ -386,6 +384,7 @@ class Learner:
             ValueError: if it can't be what a learner of these settings returned.
         """
         self._check_counters(state)
+        self._continuity.reset()
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.extract.load_state_dict(state["extract"])

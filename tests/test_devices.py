@@ -168,6 +168,7 @@ def test_what_waits_in_an_iteration_does_so_once_per_batch(name, as_on_gpu, tmp_
         trainer.collector.shutdown()
     assert found[0] == found[1]
     expected = {"trainer.py:check_finite", "evaluation.py:finished", "data/replay.py:extend", "finite.py:check"}
+    expected |= {"data/continuity.py:check"}
     starts = {"data/samplers.py:_find_starts", "data/samplers.py:episode_starts"}
     expected |= starts if name == "v3" else {"data/samplers.py:sample"}
     if name in ("hdqn", "v1", "v2"):

@@ -563,12 +563,14 @@ class TestShapes:
         learner = make_learner(num_envs=2)
         learner.store(make_batch())
         for batch in (make_batch(num_envs=3), make_batch(num_envs=1)):
+            with pytest.raises(ValueError, match="batch must hold the same 2 environments, got"):
+                learner.store(batch)
             with pytest.raises(
                 ValueError, match=r"transitions must have the shape \[2, T\] that this memory was built"
             ):
-                learner.store(batch)
+                make_learner(num_envs=2).store(batch)
         for batch in (make_batch()[0], make_batch().unsqueeze(0), make_batch().reshape(2, 2, 4)):
-            with pytest.raises(ValueError, match=r"batch must have the shape \[N, T\] of N environments and T steps"):
+            with pytest.raises(ValueError, match=r"batch must be \[N, T\], N environments and T steps"):
                 learner.store(batch)
 
 

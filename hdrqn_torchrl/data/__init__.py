@@ -1,5 +1,6 @@
 """From collected steps to replayed sequences."""
 
+from hdrqn_torchrl.data.continuity import Continuity
 from hdrqn_torchrl.data.hindsight import HindsightOptions, relabel_subgoals
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
@@ -9,6 +10,7 @@ from hdrqn_torchrl.data.samplers import EpisodeSliceSampler, EpisodeStartSampler
 
 __all__ = [
     "FROM_STARTS",
+    "Continuity",
     "EpisodeSliceSampler",
     "EpisodeStartSampler",
     "HindsightOptions",

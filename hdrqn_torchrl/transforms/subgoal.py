@@ -18,6 +18,7 @@ from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.transforms.entries import Entries
 
 
 class SubgoalTransform(Transform):
@@ -56,7 +57,7 @@ class SubgoalTransform(Transform):
             subgoal_reached_key, option_done_key, option_terminated_key, intrinsic_reward_key: entries written.
 
     Raises:
-        ValueError: if a number breaks its rule.
+        ValueError: if a number breaks its rule, or the environment does not write what is read.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -207,6 +208,25 @@ class SubgoalTransform(Transform):
             self.option_steps_key: Unbounded(shape=one, dtype=torch.int64, device=device),
             self.option_return_key: Unbounded(shape=one, dtype=torch.float32, device=device),
         }
+
+    def transform_output_spec(self, output_spec: Composite) -> Composite:
+        self._check(output_spec)
+        return super().transform_output_spec(output_spec)
+
+    def _check(self, output_spec: Composite) -> None:
+        """Refuses an environment that does not write what the book reads."""
+        parts = (output_spec.get(f"full_{name}_spec", None) for name in ("observation", "reward", "done"))
+        entries = Entries(output_spec.shape, *parts)
+        if self.critic is None:
+            entries.require_flags(self.attained_key, self.num_subgoals)
+        if self.hazard_key is not None and self.hazard_reward:
+            entries.require_flags(self.hazard_key)
+        if self.available_key is not None:
+            entries.require_flags(self.available_key, self.num_subgoals)
+        entries.require_number(self.extrinsic_reward_key)
+        for key in (self.done_key, self.terminated_key):
+            entries.require_flags(key)
+        entries.check("SubgoalTransform")
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         for key, spec in self._option_specs(observation_spec.shape, observation_spec.device).items():

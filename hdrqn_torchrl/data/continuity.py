@@ -1,0 +1,94 @@
+"""Whether collected batches are what memories take them for: the same worlds, going on from batch to batch."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from hdrqn_torchrl import keys
+
+
+class Continuity:
+    """Looks at batches ``[N, T]`` as they come and refuses what would be learned from wrongly, without a word.
+
+    Each row must go on where it ended in the last batch, in the same episode, unless that one was over or a new one
+    begins. Rows of two collectors do not: what began in one's world would end in the other's. And where an episode
+    ends, so must its option; a time limit behind :class:`~hdrqn_torchrl.transforms.SubgoalTransform` leaves it open.
+
+    Args:
+        traj_key: number of the episode.
+        init_key: first step of an episode.
+        option_done_key: under ``"next"``, for hierarchical agents.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> no, episode = torch.zeros(2, 3, 1, dtype=torch.bool), torch.tensor([[0, 0, 0], [1, 1, 1]])
+        >>> batch = TensorDict({"collector": {"traj_ids": episode}, "is_init": no, "next": {"done": no}}, [2, 3])
+        >>> continuity = Continuity()
+        >>> continuity.check(batch)
+        >>> continuity.check(batch.flip(0))
+        Traceback (most recent call last):
+        ValueError: batch must go on where the last one ended, ...
+    """
+
+    def __init__(
+        self,
+        *,
+        traj_key: NestedKey = keys.TRAJ_IDS,
+        init_key: NestedKey = keys.IS_INIT,
+        option_done_key: NestedKey = keys.OPTION_DONE,
+    ) -> None:
+        self.traj_key, self.init_key, self.option_done_key = traj_key, init_key, option_done_key
+        self.reset()
+
+    def reset(self) -> None:
+        """The next batch may be any."""
+        self._episode: Tensor | None = None  # [N, 1]: that of the last step, ...
+        self._over: Tensor | None = None  # [N, 1]: ... and whether it was over
+
+    def check(self, batch: TensorDictBase) -> None:
+        """Looks at the next batch.
+
+        Raises:
+            ValueError: if it can't be one.
+        """
+        if batch.ndim != 2:
+            raise ValueError(
+                f"batch must be [N, T], N environments and T steps of each, got {list(batch.shape)}; give one "
+                "Collector all environments, as the batches of several can't be told apart in a memory."
+            )
+        episode = batch.get(self.traj_key, None)
+        if episode is None:
+            raise ValueError(f"batch must number its episodes in {self.traj_key}; use Collector(track_traj_ids=True).")
+        if self._episode is not None and len(self._episode) != len(episode):
+            raise ValueError(f"batch must hold the same {len(self._episode)} environments, got {len(episode)}.")
+        over = batch.get("next").get(keys.DONE).squeeze(-1)
+        before = episode[:, :1] if self._episode is None else self._episode
+        over_before = over[:, :1] if self._over is None else self._over
+        episodes, ends = torch.cat([before, episode], 1), torch.cat([over_before, over], 1)
+        jumps = (episodes[:, 1:] != episodes[:, :-1]) & ~ends[:, :-1]
+        starts = batch.get(self.init_key, None)
+        if starts is not None:
+            jumps &= ~starts.squeeze(-1)
+        option_done = batch.get("next").get(self.option_done_key, None)
+        left_open = torch.zeros_like(over) if option_done is None else over & ~option_done.squeeze(-1)
+        if (jumps | left_open).any():  # one question, as a GPU has to be waited for
+            _refuse(jumps, left_open, episodes)
+        self._episode, self._over = episode[:, -1:].clone(), over[:, -1:].clone()
+
+
+def _refuse(jumps: Tensor, left_open: Tensor, episodes: Tensor) -> None:
+    if left_open.any():
+        raise ValueError(
+            "each end of an episode must end its option, got one that did not; a time limit must come before the "
+            "agent's transforms: agent.transform(TransformedEnv(env, StepCounter(max_steps=...))), and not behind "
+            "them or as Collector(max_frames_per_traj=...)."
+        )
+    row, time = jumps.nonzero()[0].tolist()
+    raise ValueError(
+        f"batch must go on where the last one ended, in every environment, got the middle of episode "
+        f"{int(episodes[row, time + 1])} after a step of episode {int(episodes[row, time])}, which was not over "
+        f"(environment {row}, step {time}); a learner takes the batches of one collector, all and in order: "
+        "give one Collector all environments instead of using several."
+    )
