@@ -43,7 +43,8 @@ def center_interval(
 ) -> tuple[Array, Array]:
     """Interval of the mean, or trimmed mean, of all values together, where each stratum is a sample of its own.
 
-    Welch and Satterthwaite's t over the strata; of a trimmed mean after Tukey and McLaughlin (1963): the variance is
+    Welch and Satterthwaite's t over the strata (where two values each and unequal spreads are trimmed it holds 90 % for
+    95); of a trimmed mean after Tukey and McLaughlin (1963): the variance is
     that of the values with those that are cut off moved to the last ones kept, its degrees of freedom count the kept
     ones.
 

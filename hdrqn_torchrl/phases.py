@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 
 from hdrqn_torchrl.learner import Learner
@@ -80,7 +81,8 @@ class Phases:
 
     def metrics(self) -> dict[str, float]:
         """Phase, success of each subgoal's last options, and of each leg since :meth:`clear` (NaN where none ended)."""
-        rates = {f"phase/success_{index}": rate for index, rate in enumerate(self.success.rates.tolist())}
+        known = self.success.rates.masked_fill(self.success.options == 0, torch.nan)
+        rates = {f"phase/success_{index}": rate for index, rate in enumerate(known.tolist())}
         for origin, row in enumerate(self.legs.rates.tolist()):
             name = "start" if origin == self.legs.num_subgoals else origin
             rates |= {f"legs/{name}_to_{target}": rate for target, rate in enumerate(row)}

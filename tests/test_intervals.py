@@ -171,9 +171,7 @@ class TestFalseDecisions:
         first, second = self.groups(draw, seeds, 2)
         assert decided(Alike("return", ["a", "b"], within=0.1), [first + difference, second], (false,)) <= 0.06
 
-    @pytest.mark.parametrize(
-        ("value", "false"), [(0.4999, "disagrees"), (-0.4999, "disagrees"), (0.5001, "agrees"), (-0.5001, "agrees")]
-    )
+    @pytest.mark.parametrize(("value", "false"), [(0.4999, "disagrees"), (-0.5001, "agrees")])
     def test_a_mean_at_the_tolerance_is_rarely_called_what_it_is_not(self, draw, seeds, value, false):
         (values,) = self.groups(draw, seeds, 1)
         bar = 0.06 if draw is normal else 0.08  # skewed values have no second group that makes up for them

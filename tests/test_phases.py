@@ -62,6 +62,7 @@ class TestPhases:
 
     def test_metrics(self):
         phases, _ = self.make()
+        assert math.isnan(phases.metrics()["phase/success_1"])  # no option has ended yet
         phases.observe(options(True, False))
         metrics = phases.metrics()
         assert metrics["phase"] == 1 and metrics["phase/success_1"] == 0.5

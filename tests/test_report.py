@@ -240,7 +240,6 @@ class TestStudies:
         assert not is_run_of(job, settings | {"algo.other": 1})
 
 
-@pytest.mark.slow
 def test_the_kept_runs_are_still_those_of_their_study():
     """Settings that were renamed or left to the task since they were made must not make strangers of them."""
     with ExitStack() as stack:
