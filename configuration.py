@@ -1,51 +1,31 @@
-"""From settings to built objects: rules for every setting, the allow-list of what may be built, runs read back.
+"""Settings and their rules; runs read back; the command line of the programs that look at runs.
 
-Beside the entry points only this file, resuming.py, sweeps.py and studies.py know hydra and omegaconf.
+Beside the entry points only this file, building.py, resuming.py, sweeps.py and studies.py know hydra and omegaconf.
 """
 
 from __future__ import annotations
 
-import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.errors import InstantiationException
-from hydra.utils import get_object, instantiate
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from arguments import check_arguments, shown
+from arguments import shown
+from building import SettingsError, build_algorithm, check_targets, explain, plain
+from hdrqn_torchrl.run_files import RunFileError, read_json
+from hdrqn_torchrl.stored_settings import read_settings
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from hdrqn_torchrl.algorithms import Algorithm
-
-ALLOWED_TARGETS = (
-    "hdrqn_torchrl.envs.MultiGoalGridEnv",
-    "hdrqn_torchrl.envs.make_montezuma",
-    "hdrqn_torchrl.algorithms.make_dqn",
-    "hdrqn_torchrl.algorithms.make_drqn",
-    "hdrqn_torchrl.algorithms.make_hdqn",
-    "hdrqn_torchrl.algorithms.make_hdrqn",
-    "hdrqn_torchrl.algorithms.make_v3",
-    "hdrqn_torchrl.learner.LearnerSettings",
-    "hdrqn_torchrl.modules.EpsilonGreedy",
-    "hdrqn_torchrl.modules.RepeatingEpsilonGreedy",
-    "hdrqn_torchrl.modules.SuccessEpsilonGreedy",
-    "hdrqn_torchrl.modules.compact_network",
-    "hdrqn_torchrl.modules.paper_network",
-    "hdrqn_torchrl.phases.PhaseOne",
-    "hdrqn_torchrl.logging.make_tensorboard_logger",
-    "hdrqn_torchrl.logging.make_wandb_logger",
-    "hdrqn_torchrl.logging.make_mlflow_logger",
-)
-"""What a ``_target_`` may name. One's own builders are added with ``allowed_targets=[package.builder]``."""
 
 
 @dataclass
@@ -96,14 +76,25 @@ class Schema:
 
 
 ConfigStore.instance().store(name="schema", node=Schema)
+PARTS = ("env", "algo", "network", "logger")
 
 
 class RunError(RuntimeError):
     """A training that could not go on, in words for its user."""
 
 
-class SettingsError(ValueError):
-    """A setting that breaks its rule, found before any work is done."""
+def resolved(config: DictConfig) -> DictConfig:
+    """Settings as one's own command line composed them, with every reference followed, once: values from here on.
+
+    Raises:
+        SettingsError: if a reference leads nowhere, or a value is missing or of another type.
+    """
+    try:
+        values = OmegaConf.merge(OmegaConf.structured(Schema), plain(config))
+    except (OmegaConfBaseException, RecursionError) as error:
+        raise SettingsError((str(error) or "settings must not refer to themselves").splitlines()[0]) from error
+    assert isinstance(values, DictConfig)
+    return values
 
 
 def check(config: DictConfig) -> None:
@@ -117,21 +108,25 @@ def check(config: DictConfig) -> None:
             raise SettingsError(
                 f"{min(unknown)} must be a known setting; `python train.py --cfg job` shows all of them."
             )
-    for key, least in (
-        ("total_frames", 1),
-        ("threads", 1),
-        ("steps_per_batch", 2),  # TorchRL's two-dimensional storage can't take single steps
-        ("log_frames", 1),
-        ("evaluation.num_envs", 1),
-        ("evaluation.episodes", 1),
-        ("evaluation.interval_frames", 1),
-        ("evaluation.final_episodes", 1),
-        ("checkpoint.interval_frames", 1),
-        ("checkpoint.keep_last", 2),  # so that there is one while the newest is being replaced
+    for key, least, most in (
+        ("total_frames", 1, 10**15),
+        ("threads", 1, 1_024),
+        ("steps_per_batch", 2, 100_000),  # TorchRL's two-dimensional storage can't take single steps
+        ("log_frames", 1, 10**15),
+        ("seed", 0, 2**62),
+        ("evaluation.num_envs", 1, 100_000),
+        ("evaluation.episodes", 1, 10**9),
+        ("evaluation.interval_frames", 1, 10**15),
+        ("evaluation.final_episodes", 1, 10**9),
+        ("evaluation.seed", 0, 2**62),
+        ("checkpoint.interval_frames", 1, 10**15),
+        ("checkpoint.keep_last", 2, 1_000),  # so that there is one while the newest is being replaced
     ):
         value = OmegaConf.select(config, key)
         if value < least:
             raise SettingsError(f"{key} must be >= {least}, got {value}; leave it out for the default.")
+        if value > most:
+            raise SettingsError(f"{key} must be <= {most:,}, got {str(value)[:25]}; leave it out for the default.")
     longest = config.evaluation.max_steps
     if longest is not None and longest < 1:
         raise SettingsError(
@@ -153,57 +148,7 @@ def check(config: DictConfig) -> None:
     loggers = OmegaConf.select(config, "logger.loggers")
     if not isinstance(loggers, ListConfig):
         raise SettingsError(f"logger.loggers must be a list, got {shown(loggers)}; [] writes metrics.csv alone.")
-    check_targets(config, config.allowed_targets)
-
-
-def check_targets(config: DictConfig, allowed: list[str]) -> None:
-    """Refuses every ``_target_`` outside the allow-list. Runs before anything is built.
-
-    Args:
-        config: settings that will be instantiated.
-        allowed: names allowed beside :data:`ALLOWED_TARGETS`; never read from the run folder itself.
-    """
-    for path, target in _targets(config):
-        if target not in ALLOWED_TARGETS and target not in allowed:
-            raise SettingsError(
-                f"{path} must be one of the builders that this program trusts, got {target!r}. If you wrote this "
-                f"setting and trust it, add 'allowed_targets=[{target}]' to the command."
-            )
-
-
-def _targets(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every ``_target_`` in a configuration, with its full name."""
-    if isinstance(node, DictConfig):
-        for key in node:
-            name = f"{path}.{key!s}" if path else str(key)
-            if key == "_target_":
-                yield name, node[key]
-            else:
-                yield from _targets(node[key], name)
-    elif isinstance(node, ListConfig):
-        for index, item in enumerate(node):
-            yield from _targets(item, f"{path}[{index}]")
-
-
-def check_types(config: DictConfig) -> None:
-    """Refuses values of other types than the builders' annotations ask for. It loads what is to be built.
-
-    Raises:
-        ValueError: with key, rule and value.
-    """
-    for name in ("env", "algo", "network"):
-        check_arguments(config[name], name, get_object)
-    played = {"_target_": config.env._target_, **config.evaluation.env}
-    check_arguments(played, "evaluation.env", get_object)
-    for index, logger in enumerate(config.logger.loggers):
-        check_arguments(logger, f"logger.loggers[{index}]", get_object)
-
-
-def build_algorithm(config: DictConfig, **env_changes) -> tuple[EnvBase, Algorithm]:
-    """The bare environment and the algorithm of a configuration."""
-    check_types(config)
-    env = instantiate(config.env, **env_changes)
-    return env, instantiate(config.algo, env, instantiate(config.network))
+    check_targets(plain(config), config.allowed_targets)
 
 
 def pick_device(name: str, has_cuda: bool) -> str:
@@ -215,21 +160,8 @@ def pick_device(name: str, has_cuda: bool) -> str:
     return ("cuda" if has_cuda else "cpu") if name == "auto" else name
 
 
-def explain(error: Exception) -> str:
-    """The cause of a failed instantiation, with the full name of the setting in front."""
-    if not isinstance(error, InstantiationException):
-        return str(error)
-    path = str(error).rpartition("full_key: ")[2].strip() if "full_key: " in str(error) else ""
-    cause = error.__cause__
-    if isinstance(cause, (ImportError, OSError)):
-        return str(cause)
-    if isinstance(cause, ValueError):
-        return f"{path}.{cause}" if path else str(cause)
-    return f"{path}: {cause or error}; `python train.py --cfg job` shows every setting and its default."
-
-
 def read_config(folder: Path) -> DictConfig:
-    """``config.yaml`` of a run folder. Nothing in it is trusted: see :func:`check_targets`."""
+    """``config.yaml`` of a run folder. Nothing in it is trusted: see building.py."""
     path = folder / "config.yaml"
     if not path.is_file():
         raise SettingsError(
@@ -237,16 +169,15 @@ def read_config(folder: Path) -> DictConfig:
             "the default place of runs is outputs/."
         )
     try:
-        stored = OmegaConf.load(path)
-        config = OmegaConf.merge(OmegaConf.structured(Schema), stored)
-        OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        if not all(
-            isinstance(OmegaConf.select(config, part), DictConfig) for part in ("env", "algo", "network", "logger")
-        ):
-            raise TypeError("env, algo, network and logger must have settings below them")
-    except (OmegaConfBaseException, YAMLError, OSError, ValueError, TypeError, AssertionError, RecursionError) as error:
+        config = OmegaConf.merge(OmegaConf.structured(Schema), OmegaConf.create(read_settings(path)))
+        OmegaConf.to_container(config, throw_on_missing=True)
+        if not all(isinstance(config[part], DictConfig) for part in PARTS):
+            raise TypeError(f"{', '.join(PARTS)} must have settings below them")
+    except RunFileError as error:
+        raise SettingsError(str(error)) from error
+    except (OmegaConfBaseException, OSError, ValueError, TypeError, AssertionError) as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise SettingsError(f"{path} can't be read as the settings of a run: {reason}") from error
+        raise SettingsError(f"{path} can't be read as the settings of a run: {reason}.") from error
     assert isinstance(config, DictConfig)
     return config
 
@@ -254,7 +185,7 @@ def read_config(folder: Path) -> DictConfig:
 def read_choices(folder: Path) -> dict[str, str]:
     """Which file of each group of conf/ a run was composed of (``{"env": "gridworld", "algo": "v2", ...}``)."""
     try:
-        choices = json.loads((folder / "run.json").read_text())["choices"]
+        choices = read_json(folder / "run.json")["choices"]
         return {str(group): str(choice) for group, choice in choices.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}  # it is for headings and comparisons only
@@ -285,7 +216,7 @@ def load_agent(
         checkpoint: ``"best"``, ``"last"``, or the path of a checkpoint or weights file.
         num_envs: number of worlds of the environment.
         env_changes: settings of the environment that shall differ from the run's.
-        allowed_targets: see :func:`check_targets`.
+        allowed_targets: see :func:`building.build`.
 
     Raises:
         SettingsError: if the folder is not a run, names something that may not be built, or its weights do not fit.
@@ -294,13 +225,13 @@ def load_agent(
 
     folder = Path(run)
     config = read_config(folder)
-    for key, value in {**config.evaluation.env, **(env_changes or {})}.items():
+    changes = {**plain(config.evaluation.env), **(env_changes or {})}
+    for key in changes:
         if key.startswith("_") or key not in config.env:
             raise SettingsError(f"env.{key} must be one of {sorted(set(config.env) - {'_target_'})}; it is none.")
-        config.env[key] = value
-    check_targets(config, allowed_targets or [])
+    config.env = plain(config.env) | changes
     try:
-        env, algorithm = build_algorithm(config, num_envs=num_envs, device="cpu")
+        env, algorithm = build_algorithm(config, {"num_envs": num_envs, "device": "cpu"}, allowed_targets or [])
         load_policy(algorithm.policy, folder / "checkpoints", checkpoint)
     except (InstantiationException, ValueError) as error:
         raise SettingsError(explain(error)) from error

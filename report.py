@@ -26,7 +26,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from omegaconf import MISSING
 from PIL import Image
 
@@ -37,7 +36,8 @@ from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimat
 from hdrqn_torchrl.figures import plot_legs_over_time
 from hdrqn_torchrl.grouping import Entry, value_of
 from hdrqn_torchrl.results import final_value
-from plot import YAML_LOADER, as_list, common_references, read_entries
+from hdrqn_torchrl.run_files import read_json
+from plot import as_list, common_references, read_entries
 from studies import STUDIES, Drawing, Job, Study, flat, is_run_of, jobs_of
 
 KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json", "evaluations/*.json")
@@ -128,10 +128,9 @@ def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
         places.append(pattern)
     found = []
     for entry in read_entries(places):
-        config, origin = (entry.run.folder / name for name in ("config.yaml", "run.json"))
-        if config.exists() and origin.exists():
-            settings = flat(yaml.load(config.read_text(), YAML_LOADER))
-            found.append(Found(entry, settings, yaml.load(origin.read_text(), YAML_LOADER)))
+        origin = entry.run.folder / "run.json"
+        if entry.settings and origin.exists():
+            found.append(Found(entry, flat(entry.settings), read_json(origin)))
     return found
 
 

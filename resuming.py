@@ -14,10 +14,13 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from building import plain
 from configuration import SettingsError, check, read_choices, read_config
 
 FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets", "evaluation.ceilings")
 """Settings that may differ when a run is resumed: they don't change what is learned."""
+FOLLOWS = "learning_rate_frames"
+"""Settings of this name that are equal to ``total_frames`` are raised with it."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ def plan(config: DictConfig, folder: Path) -> Plan:
     """Follows ``resume``.
 
     Args:
-        config: settings as Hydra composed them.
+        config: settings as Hydra composed them, all references followed (:func:`configuration.resolved`).
         folder: Hydra's new run folder.
 
     Raises:
@@ -118,9 +121,18 @@ def with_overrides(
         if key in stored_choices and key not in config:
             raise SettingsError(f"{override} can't be given with resume=FOLDER: settings come from that run.")
         OmegaConf.update(config, key, OmegaConf.select(given, key), merge=False, force_add=True)
+    if config.total_frames > stored.total_frames:
+        for path in _following(plain(stored)):
+            OmegaConf.update(config, path, config.total_frames)
     config.allowed_targets = given.allowed_targets  # never from the run folder
     config.resume, config.resume_override = given.resume, given.resume_override
     return config
+
+
+def _following(settings: dict[str, Any]) -> list[str]:
+    """Full names of the settings that end when the training does."""
+    total = settings["total_frames"]
+    return [key for key, value in _flat(settings["algo"], "algo").items() if key.endswith(FOLLOWS) and value == total]
 
 
 def refuse_differences(run: Path, config: DictConfig) -> None:
@@ -144,15 +156,25 @@ def refuse_going_back(checkpoint: Path) -> None:
 
 
 def differences(stored: DictConfig, config: DictConfig) -> list[str]:
-    """Settings that changed, one line each. Raising ``total_frames`` is none."""
-    before, after = (_flat(OmegaConf.to_container(each, resolve=False)) for each in (stored, config))
+    """Settings that changed, one line each. Raising ``total_frames`` is none, nor is what follows it."""
+    before, after = (_flat(_without_copies(plain(each))) for each in (stored, config))
     frames = before.pop("total_frames"), after.pop("total_frames")
     changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
     for key in sorted(before.keys() | after.keys()):
         old, new = before.get(key, "(not set)"), after.get(key, "(not set)")
-        if old != new and not {key, key.partition(".")[0]} & set(FREE):
+        follows = key.endswith(FOLLOWS) and (old, new) == frames
+        if old != new and not follows and not {key, key.partition(".")[0]} & set(FREE):
             changed.append(f"{key}: {old} -> {new}")
     return changed
+
+
+def _without_copies(settings: dict[str, Any]) -> dict[str, Any]:
+    """Leaves out what loggers are given to show: it stands elsewhere, too."""
+    loggers = (settings.get("logger") or {}).get("loggers")
+    for logger in loggers if isinstance(loggers, list) else []:
+        if isinstance(logger, dict):
+            logger.pop("settings", None)
+    return settings
 
 
 def _flat(node: Any, path: str = "") -> dict[str, Any]:

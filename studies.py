@@ -12,6 +12,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
+from building import plain
 from hdrqn_torchrl.claims import Alike, Claim, Near, Ordered
 from hdrqn_torchrl.comparison import GREEDY, PAPER, Panel
 from resuming import FREE
@@ -175,7 +176,7 @@ class Job:
     overrides: dict[str, str]
     """What the sweep sets, as text."""
     settings: dict[str, Any]
-    """All settings by their full names (:func:`flat`), interpolations left in."""
+    """All settings by their full names (:func:`flat`)."""
 
     def label(self, keys: Iterable[str]) -> str:
         """Values of some of its overrides, names of files of conf/ as they are.
@@ -209,10 +210,10 @@ def jobs_of(experiment: str) -> list[Job]:
         jobs = []
         for chosen in itertools.product(*files):
             config = compose("config", overrides=[first, *map("=".join, chosen)])
-            settings = flat(OmegaConf.to_container(config, resolve=False))
             for given in itertools.product(*values):
-                set_ = {key: parser.parse_override(f"{key}={value}").value() for key, value in given}
-                jobs.append(Job(dict([*chosen, *given]), settings | set_))
+                for key, value in given:
+                    OmegaConf.update(config, key, parser.parse_override(f"{key}={value}").value(), force_add=True)
+                jobs.append(Job(dict([*chosen, *given]), flat(plain(config))))
     return jobs
 
 

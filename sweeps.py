@@ -20,8 +20,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -186,6 +188,11 @@ class _Stop:
 
 
 _stop = _Stop()
+
+
+def is_sweep() -> bool:
+    """Whether this process does jobs of ``train.py -m``."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
 def in_worker() -> bool:

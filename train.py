@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import InstantiationException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 import sweeps
-from configuration import RunError, SettingsError, build_algorithm, check, explain, pick_device
+from building import build, build_algorithm, build_env, explain, plain
+from configuration import RunError, SettingsError, check, pick_device, resolved
 from resuming import Plan, holds_run, plan, record
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ def main(config: DictConfig) -> float:
     os.chdir(HydraConfig.get().runtime.cwd)  # where paths were given: hydra.job.chdir=true would move below them
     sweeps.refuse_if_stopped()
     try:
+        config = resolved(config)
         check(config)
         run = plan(config, folder)
         return train(run)
@@ -48,7 +49,7 @@ def main(config: DictConfig) -> float:
     except Exception as error:
         if run is None and not holds_run(folder):
             note_error(folder)
-        if HydraConfig.get().mode == RunMode.MULTIRUN or not isinstance(error, (SettingsError, RunError)):
+        if sweeps.is_sweep() or not isinstance(error, (SettingsError, RunError)):
             raise
         sys.exit(f"error: {error}")
 
@@ -64,7 +65,7 @@ def train(run: Plan) -> float:
     from hdrqn_torchrl.run_folder import locked
 
     torch.set_num_threads(run.config.threads)
-    patience = sweeps.PATIENCE_SECONDS if HydraConfig.get().mode == RunMode.MULTIRUN else 0.0
+    patience = sweeps.PATIENCE_SECONDS if sweeps.is_sweep() else 0.0
     with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
         refused = (InstantiationException, ValueError, CheckpointError) if run.resumed else ()
         with noting_errors(run, unless=refused):
@@ -120,7 +121,7 @@ def note_error(folder: Path) -> None:
 
 
 def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
-    """Builds what a run needs (:func:`build`), where it begins or where it goes on; clears what is out of date."""
+    """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
     from hdrqn_torchrl.checkpoint import Checkpoints
 
     checkpoints = Checkpoints(run.folder / "checkpoints")
@@ -129,7 +130,7 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     stale = [*run.folder.glob("*.partial"), *([run.folder / "metrics.csv"] if start is None else [])]
     for path in stale:
         path.unlink(missing_ok=True)
-    trainer, evaluation_env, references = build(run)
+    trainer, evaluation_env, references = build_run(run)
     if start is not None:
         trainer.resume(start)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
@@ -159,11 +160,10 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, referenc
     return summary
 
 
-def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
+def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     """Everything that a run needs: trainer, evaluation environment, scripted references."""
     import numpy
     import torch
-    from hydra.utils import instantiate
 
     from hdrqn_torchrl.checkpoint import Checkpoints
     from hdrqn_torchrl.collectors import ResumableCollector
@@ -178,9 +178,10 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     random.seed(config.seed)
     numpy.random.seed(config.seed)
     torch.manual_seed(config.seed)
-    env, algorithm = build_algorithm(config, seed=config.seed, device=device)
-    played = {"num_envs": config.evaluation.num_envs, "device": device, **config.evaluation.env}
-    evaluation_base = instantiate(config.env, **played)
+    allowed = config.allowed_targets
+    env, algorithm = build_algorithm(config, {"seed": config.seed, "device": device}, allowed)
+    played = {"num_envs": config.evaluation.num_envs, "device": device, **plain(config.evaluation.env)}
+    evaluation_base = build_env(config, played, allowed)
     if found := interface_differences(env, evaluation_base):
         raise ValueError(
             f"evaluation.env must leave what the agent sees and does as it is in training, got "
@@ -205,8 +206,11 @@ def build(run: Plan) -> tuple[Trainer, EnvBase, dict]:
         logger=RunLogger(
             run.folder,
             total_frames=config.total_frames,
-            loggers=[instantiate(logger, run.folder) for logger in config.logger.loggers],
-            label=run.folder.name if HydraConfig.get().mode == RunMode.MULTIRUN else "",
+            loggers=[
+                build(logger, run.folder, place=f"logger.loggers[{index}]", allowed=allowed)
+                for index, logger in enumerate(config.logger.loggers)
+            ],
+            label=run.folder.name if sweeps.is_sweep() else "",
         ),
         evaluate=lambda: evaluate(
             evaluation_env,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import csv
 import glob
-import json
+import os
 import re
-from collections.abc import Iterable
+from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hdrqn_torchrl.run_files import RunFileError, read_json, read_text
+
 Metrics = dict[str, list[float]]
 References = dict[str, dict[str, float]]
 Array = NDArray[np.floating[Any]]
 
 METRICS_FILE = "metrics.csv"
+LARGEST_WIDTH = 10_000  # columns; 100 subgoals have as many legs
 _SHARES = ("success", "in_order")
 _UNTIL = re.compile(r"(?P<axis>frames|episodes|updates|wall_seconds) until (?P<column>\S+) *>= *(?P<level>-?[\d.]+)")
 
@@ -48,10 +52,20 @@ def find_runs(patterns: Iterable[str]) -> list[Path]:
     for pattern in patterns:
         pattern = glob.escape(pattern) if Path(pattern).exists() else pattern  # folders may have brackets in their name
         start = pattern.removesuffix(METRICS_FILE).rstrip("/").removesuffix("**").rstrip("/")
-        root = f"{Path(start).expanduser()}/" if start or pattern.startswith("/") else ""
-        files = glob.iglob(f"{root}**/{METRICS_FILE}", recursive=True)  # noqa: PTH207  (Path.glob wants relative ones)
-        found.update(Path(file).parent for file in files)
+        root = str(Path(start).expanduser()) if start else "/" if pattern.startswith("/") else "."
+        for place in glob.iglob(root, recursive=True):  # noqa: PTH207  (Path.glob wants relative ones)
+            found.update(_runs_below(Path(place)))
     return sorted(found)
+
+
+def _runs_below(place: Path) -> Iterator[Path]:
+    """Run folders at or below a folder; links to run folders count, others are not followed: they may lead round."""
+    for folder, inner, files in os.walk(place):
+        if METRICS_FILE in files:
+            yield Path(folder)
+        for each in map(Path(folder).joinpath, inner):
+            if each.is_symlink() and (each / METRICS_FILE).exists():
+                yield each
 
 
 def read_metrics(path: Path) -> Metrics:
@@ -60,18 +74,25 @@ def read_metrics(path: Path) -> Metrics:
     Raises:
         ValueError: if the file is not a table of numbers.
     """
-    complete = path.read_text().rpartition("\n")[0]
     try:
-        names, *rows = csv.reader(complete.splitlines()) if complete else [[]]
-        for line, row in enumerate(rows, 2):
-            if len(row) != len(names):
-                raise ValueError(f"line {line} has {len(row)} cells, the header has {len(names)}")
-        columns = zip(*rows, strict=True) if rows else ([] for _ in names)
-        return {name: [float(cell or "nan") for cell in column] for name, column in zip(names, columns, strict=True)}
+        rows = csv.reader(read_text(path).rpartition("\n")[0].splitlines())
+        names = next(rows, [])
+        if len(names) > LARGEST_WIDTH:
+            raise ValueError(f"it has {len(names):,} columns, more than {LARGEST_WIDTH:,}")
+        table = [_numbers(row, len(names), line) for line, row in enumerate(rows, 2)]
+        return {name: [row[place] for row in table] for place, name in enumerate(names)}
+    except RunFileError:
+        raise
     except (ValueError, csv.Error) as error:
         raise ValueError(
             f"{path} must be a table of numbers: {error}; leave the run out or repair the file."
         ) from error
+
+
+def _numbers(row: list[str], width: int, line: int) -> array[float]:
+    if len(row) != width:
+        raise ValueError(f"line {line} has {len(row)} cells, the header has {width}")
+    return array("d", [float(cell or "nan") for cell in row])
 
 
 def read_run(folder: Path) -> Run:
@@ -88,6 +109,8 @@ def read_run(folder: Path) -> Run:
     frames = metrics.get("frames", np.empty(0))
     if not len(frames):
         raise ValueError(f"{folder / METRICS_FILE} has no complete log point (a row with its frames) yet.")
+    if not np.isfinite(frames).all():
+        raise ValueError(f"{folder / METRICS_FILE} must tell the frames of every row, got {frames.tolist()[:10]}.")
     kept = frames <= _least_from_here(frames)
     return Run(
         folder,
@@ -100,11 +123,15 @@ def read_run(folder: Path) -> Run:
 def _read_summary(path: Path, last_frames: float) -> dict[str, float]:
     if not path.exists():
         return {}
-    try:
-        summary = {name: value for name, value in json.loads(path.read_text()).items() if value is not None}
-    except (ValueError, AttributeError) as error:
-        raise ValueError(f"{path} must hold the results of a run as one JSON object: {error}.") from error
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} must hold the results of a run as one JSON object, got {type(found).__name__}.")
+    summary = {name: float(value) for name, value in found.items() if _is_number(value)}
     return summary if summary.get("frames", 0) >= last_frames else {}
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300  # which NaN is not
 
 
 def _least_from_here(x: Array) -> Array:

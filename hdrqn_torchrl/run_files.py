@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import IO, Any
 
 MEGABYTE = 1 << 20
-LIMITS = {".yaml": MEGABYTE, ".json": 16 * MEGABYTE, ".csv": 32 * MEGABYTE, ".txt": MEGABYTE}
+LIMITS = {".yaml": MEGABYTE, ".json": 16 * MEGABYTE, ".csv": 24 * MEGABYTE, ".txt": MEGABYTE}
 """Largest sizes in bytes of files that are read whole, by ending; several times what the longest runs write."""
 
 _GUARDED = 0

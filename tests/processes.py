@@ -118,7 +118,7 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
 
     diary, orphans, began = Diary(folder / "diary.jsonl"), leftovers(folder), time.monotonic()
 
-    def build(run):
+    def build_run(run):
         own_seed = 99 if any((folder / "checkpoints").glob("checkpoint-*")) else seed
         seed_everything(own_seed)
         trainer = make_training(folder, name, seed=own_seed, **settings)
@@ -143,7 +143,7 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
         diary.note("start", frames=trainer.frames, orphans=orphans, left=leftovers(folder), seconds=seconds)
         return trainer, *rest
 
-    begin, train.build, train.begin = train.begin, build, noted_begin
+    begin, train.build_run, train.begin = train.begin, build_run, noted_begin
     train.record, train.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
     train.train(Plan(folder, OmegaConf.create({"threads": 1}), {}, resumed=True))
     diary.note("done")

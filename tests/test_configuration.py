@@ -14,19 +14,18 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import MISSING, OmegaConf
 
+import building
 import configuration
+from building import ALLOWED_TARGETS, build_algorithm, check_targets, explain, plain
 from configuration import (
-    ALLOWED_TARGETS,
     SettingsError,
-    build_algorithm,
     check,
-    check_targets,
     command_line,
-    explain,
     load_agent,
     pick_device,
     read_choices,
     read_config,
+    resolved,
 )
 from hdrqn_torchrl.checkpoint import Checkpoints, save_weights
 
@@ -121,14 +120,16 @@ class TestCheckTargets:
     )
     def test_all_others_are_refused_by_their_place(self, settings, key, value, path):
         OmegaConf.update(settings, key, value, merge=False, force_add=True)
-        with pytest.raises(SettingsError, match=f"^{re.escape(path)} must be one of the builders that .* trusts, got "):
-            check_targets(settings, [])
+        with pytest.raises(
+            SettingsError, match=f"^{re.escape(path)} must be one of the builders that .* trusts there, got "
+        ):
+            check_targets(plain(settings), [])
 
     def test_ones_own_builders_can_be_added(self, settings):
         settings.env._target_ = "my_package.MyEnv"
         with pytest.raises(SettingsError, match=r"add 'allowed_targets=\[my_package\.MyEnv\]' to the command"):
-            check_targets(settings, ["my_package.Other"])
-        check_targets(settings, ["my_package.MyEnv"])
+            check_targets(plain(settings), ["my_package.Other"])
+        check_targets(plain(settings), ["my_package.MyEnv"])
         settings.allowed_targets = ["my_package.MyEnv"]
         check(settings)
 
@@ -227,7 +228,7 @@ def write_run(folder, text=None, *, weights=True):
     if not weights:
         return
     torch.manual_seed(0)
-    _, algorithm = configuration.build_algorithm(config)
+    _, algorithm = build_algorithm(config)
     checkpoints = Checkpoints(folder / "checkpoints")
     for step, score in ((100, 0.5), (200, None)):
         with torch.no_grad():
@@ -305,8 +306,8 @@ class TestLoadAgent:
 class TestReadConfig:
     def test_what_was_written_comes_back(self, run, settings):
         config = read_config(run)
-        assert config == settings
-        assert OmegaConf.is_interpolation(config.algo.sub, "learning_rate_frames")  # it follows total_frames
+        assert config == resolved(settings) and plain(config) == plain(settings)
+        assert "${" not in OmegaConf.to_yaml(config) and config.algo.sub.learning_rate_frames == config.total_frames
 
     def test_a_run_older_than_the_setting_was_in_single_precision(self, run):
         path = run / "config.yaml"
@@ -386,6 +387,37 @@ HOSTILE = {
     "name from a variable": lambda: changed(env=MAKE | {"_target_": "${oc.env:HOSTILE_TARGET}"}),
     "name from another setting": lambda: changed(env=MAKE | {"_target_": "${output_root}"}, output_root="os.makedirs"),
     "name in two halves": lambda: changed(env=MAKE | {"_target_": "os.${output_root}"}, output_root="makedirs"),
+    "name that changes with the device": lambda: changed(
+        env__t={"auto": "hdrqn_torchrl.envs.MultiGoalGridEnv", "cpu": "os.makedirs"},
+        env__device="auto",
+        env__name="MARKER",
+        env___target_="${.t.${.device}}",
+    ),
+    "name that changes with the number of worlds": lambda: changed(
+        env__num_envs=4,
+        network=MAKE
+        | {"t": {"4": "hdrqn_torchrl.modules.compact_network", "1": "os.makedirs"}}
+        | {"_target_": "${.t.${env.num_envs}}"},
+    ),
+    "settings for evaluations from a resolver": lambda: changed(
+        evaluation__env="${oc.decode:'{layout: {_target_: os.makedirs, name: MARKER}}'}"
+    ),
+    "settings for evaluations": lambda: changed(evaluation__env={"layout": MAKE}),
+    "a value of the reader's": lambda: changed(output_root="${oc.env:HOSTILE_TARGET}"),
+    "a value of the reader's, quoted": lambda: changed(env__layout=["${oc.decode:${oc.env:HOSTILE_TARGET}}"]),
+    "escaped": lambda: changed(output_root=r"\${oc.env:HOSTILE_TARGET}"),
+    "a logger in an algorithm": lambda: changed(
+        algo__sub_exploration={"_target_": "hdrqn_torchrl.logging.make_tensorboard_logger", "folder": "MARKER"}
+    ),
+    "a logger in a logger": lambda: changed(
+        logger__loggers=[
+            {"_target_": "hdrqn_torchrl.logging.make_wandb_logger", "project": MAKE | {"_recursive_": False}}
+        ]
+    ),
+    "what a logger shows is built": lambda: changed(
+        logger__loggers=[{"_target_": "hdrqn_torchrl.logging.make_wandb_logger", "settings": MAKE}]
+    ),
+    "mode": lambda: changed(algo___convert_="all"),
     "section from another": lambda: changed(network__evil=MAKE, env="${network.evil}"),
     "section from a resolver": lambda: changed(env='${oc.create:{_target_: os.makedirs, name: "MARKER"}}'),
     "list from a resolver": lambda: changed(logger__loggers='${oc.create:[{_target_: os.makedirs, name: "MARKER"}]}'),
@@ -412,6 +444,12 @@ HOSTILE = {
 }
 
 
+REFUSED_WHEN_BUILT = (
+    "a builder with other arguments",
+    "a builder with a class for a number",
+)
+
+
 @pytest.fixture
 def hostile_run(tmp_path, monkeypatch):
     """Writes a run folder; afterwards nothing may have been executed."""
@@ -428,9 +466,22 @@ def hostile_run(tmp_path, monkeypatch):
 
 
 class TestHostileRunFolders:
+    def test_what_is_checked_is_what_is_built(self, hostile_run):
+        """Hydra follows references when it builds: this name is harmless before the device is set, and not after."""
+        config = OmegaConf.create(HOSTILE["name that changes with the device"]())
+        config.env.name = str(hostile_run(changed()) / "marker")
+        assert plain(config.env)["_target_"] == "hdrqn_torchrl.envs.MultiGoalGridEnv"
+        config.env.device = "cpu"
+        assert plain(config.env)["_target_"] == "os.makedirs"
+        with pytest.raises(SettingsError, match=r"env\._target_ must be one of .* got 'os\.makedirs'"):
+            build_algorithm(config)
+        config.env.device = "auto"
+        with pytest.raises(InstantiationException, match="unexpected keyword argument 't'"):
+            build_algorithm(config, {"device": "cpu"})
+
     def test_the_trap_works(self, tmp_path, monkeypatch):
         """Without the check it would be executed."""
-        monkeypatch.setattr(configuration, "check_targets", lambda *_: None)
+        monkeypatch.setattr(building, "check_targets", lambda *_: None)
         kinds = ("a part of a part", "in place of a number", "through a module of the package")
         for number, kind in enumerate([*kinds, "allowed by itself, in part"]):
             write_run(tmp_path, HOSTILE[kind]().replace("MARKER", str(tmp_path / str(number))), weights=False)

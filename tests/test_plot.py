@@ -9,6 +9,7 @@ import pytest
 
 import plot
 from configuration import command_line
+from hdrqn_torchrl import run_files
 
 ROOT = Path(plot.__file__).parent
 CONFIG = """\
@@ -324,8 +325,10 @@ def test_many_runs_are_read_quickly(tmp_path, monkeypatch):
     """Nothing is read twice, and settings not by OmegaConf's slow parser."""
     for seed in range(5):
         make_run(tmp_path / f"outputs/{seed}", seed=seed)
-    reads, read_text = [], Path.read_text
-    monkeypatch.setattr(Path, "read_text", lambda path, *args: (reads.append(path), read_text(path, *args))[1])
+    reads, open_file = [], run_files.open_file
+    monkeypatch.setattr(
+        run_files, "open_file", lambda path, *rest, **named: (reads.append(path), open_file(path, *rest, **named))[1]
+    )
     monkeypatch.setattr("omegaconf.OmegaConf.load", None)
     assert len(plot.read_entries([str(tmp_path / "outputs/**")])) == 5
     assert len(reads) == len(set(reads)) == 20

@@ -81,7 +81,8 @@ class TestReading:
         [
             ("frames\n", None, "no complete log point"),
             ("loss\n1\n", None, "no complete log point"),
-            ("frames\n1\n", "[1", "summary.json must hold"),
+            ("frames\n1\n", "[1", "summary.json must be a JSON file"),
+            ("frames\nnan\n", None, "must tell the frames of every row"),
             ("frames\n1\n", "[1]", "summary.json must hold"),
         ],
     )

@@ -397,7 +397,9 @@ class TestWhatIsLeftAlone:
         (a_run / "config.yaml").write_text(text.replace("hdrqn_torchrl.modules.compact_network", "os.makedirs"))
         before = snapshot(a_run)
         told = self.refused(a_run.parent, "resume=run")
-        assert "network._target_ must be one of the builders that this program trusts, got 'os.makedirs'" in told[-1]
+        assert (
+            "network._target_ must be one of the builders that this program trusts there, got 'os.makedirs'" in told[-1]
+        )
         assert snapshot(a_run) == before
 
 

@@ -29,7 +29,7 @@ def make_run(folder, algo="v2"):
     checkpoints = Checkpoints(folder / "checkpoints")
     for step, score in ((1, 1.0), (2, 0.5)):
         torch.manual_seed(step)
-        checkpoints.save({"policy": build_algorithm(config, num_envs=1)[1].policy}, step=step, score=score)
+        checkpoints.save({"policy": build_algorithm(config, {"num_envs": 1})[1].policy}, step=step, score=score)
     return folder
 
 
@@ -90,7 +90,7 @@ def test_settings_change_what_is_played(run, command, monkeypatch):
 def test_frames_are_those_of_the_loaded_weights(run, tmp_path, command, monkeypatch):
     """Against an agent built and loaded here."""
     config = OmegaConf.load(run / "config.yaml")
-    env, algorithm = build_algorithm(config, num_envs=1)
+    env, algorithm = build_algorithm(config, {"num_envs": 1})
     torch.manual_seed(3)
     for parameter in algorithm.policy.parameters():
         torch.nn.init.normal_(parameter)
