@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import csv
-import importlib
-import json
 import math
 import os
-import secrets
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torchrl.record.loggers.common import Logger
 
-from hdrqn_torchrl.locking import lock
+from hdrqn_torchrl.services import make_mlflow_logger, make_tensorboard_logger, make_wandb_logger
+
+__all__ = ["CSVLog", "RunLogger", "make_mlflow_logger", "make_tensorboard_logger", "make_wandb_logger"]
 
 Row = dict[str, float]
 
@@ -65,6 +61,11 @@ class CSVLog:
         """All whole rows; a killed process may have left half of one at the end."""
         text = self.path.read_text()
         return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+
+    def last_frames(self) -> int:
+        """``frames`` of the last row; -1 if there is none."""
+        rows = self._read() if self.path.exists() else []
+        return int(rows[-1]["frames"]) if rows else -1
 
     def _rewrite(self, columns: list[str], rows: list[dict[str, str]]) -> None:
         self.columns, self.rows = columns, len(rows)
@@ -122,14 +123,17 @@ class RunLogger:
         self._task = self._progress.add_task("training", total=total_frames, numbers="")
         self._progress.start()
         self._last_greedy = ""
+        self._going = False
 
     def log(self, row: Row) -> None:
         """Writes one log point; ``row["frames"]`` is its position, NaN a value that was not measured: an empty cell."""
+        self._go_on()
         self.csv.write(row)
         row = measured(row)
         frames = int(row["frames"])
         for logger in self.loggers:
-            logger.log_metrics(row, step=frames)
+            if frames > getattr(logger, "logged_until", -1):
+                logger.log_metrics(row, step=frames)
         evaluated = "greedy/return" in row
         if evaluated:
             ceiling = f" of {row['greedy/ceiling']:.2f}" if "greedy/ceiling" in row else ""
@@ -140,12 +144,24 @@ class RunLogger:
         if evaluated and not self.console.is_terminal:
             self.console.print(f"{self.label}{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
 
+    def _go_on(self) -> None:
+        """Before the first row: loggers that can go back to the last row of the table do so."""
+        if not self._going:
+            last = self.csv.last_frames()
+            for logger in self.loggers:
+                if hasattr(logger, "go_back_to"):
+                    logger.go_back_to(last)
+            self._going = True
+
     def say(self, sentence: str) -> None:
         """Prints a line above the progress bar."""
         self.console.print(f"{self.label}{sentence}", highlight=False, soft_wrap=True, markup=False)
 
     def state_dict(self) -> dict[str, Any]:
-        """Its position in the files."""
+        """Its position in the files; what loggers held back is written, too."""
+        for logger in self.loggers:
+            if hasattr(logger, "flush"):
+                logger.flush()
         return {"csv": self.csv.state_dict(), "last_greedy": self._last_greedy}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -180,134 +196,3 @@ def progress_line(row: Row, greedy: str) -> str:
     if "behaviour/return" in row:
         parts.append(f"behaviour {row['behaviour/return']:+.2f}")
     return " | ".join([*parts, greedy, "epsilon " + ", ".join(epsilons)])
-
-
-def make_tensorboard_logger(folder: Path) -> Logger:
-    """TorchRL's TensorBoard logger, writing to ``folder/tensorboard``."""
-    from torchrl.record.loggers.tensorboard import TensorboardLogger
-
-    return TensorboardLogger("tensorboard", log_dir=str(folder))
-
-
-def make_wandb_logger(
-    folder: Path, *, project: str = "hdrqn_torchrl", offline: bool = False, settings: dict[str, Any] | None = None
-) -> Logger:
-    """TorchRL's Weights & Biases logger, writing to ``folder/wandb``.
-
-    ``folder/wandb.json`` keeps the id of the W&B run: a resumed run goes on with it.
-
-    Args:
-        folder: run folder; its last two parts are the name of the W&B run.
-        project: W&B project.
-        offline: keeps everything in ``folder/wandb``; ``wandb sync`` uploads it later.
-        settings: shown beside the curves.
-
-    Raises:
-        ImportError: if wandb is not installed.
-    """
-    _require("wandb")
-    from torchrl.record.loggers.wandb import WandbLogger
-
-    run_id = _recorded(folder / "wandb.json") or secrets.token_hex(4)
-    _record(folder / "wandb.json", run_id)
-    logger = WandbLogger(
-        _name(folder),
-        save_dir=str(folder),
-        id=run_id,
-        project=project,
-        mode="offline" if offline else None,  # the logger's own offline= would stay set for later runs in this process
-        reinit="finish_previous",  # of a sweep
-        log_env_packages=False,  # paths of this machine
-    )
-    logger.log_hparams(settings or {})
-    return logger
-
-
-def make_mlflow_logger(
-    folder: Path,
-    *,
-    tracking_uri: str,
-    experiment: str = "hdrqn_torchrl",
-    settings: dict[str, Any] | None = None,
-) -> Logger:
-    """TorchRL's MLflow logger.
-
-    ``folder/mlflow.json`` keeps the id of the MLflow run: a resumed run goes on with it.
-
-    Args:
-        folder: run folder; its last two parts are the name of the MLflow run.
-        tracking_uri: address of a server, or ``sqlite:///`` and the path of a file, which is created.
-        experiment: MLflow experiment; created if it does not exist.
-        settings: logged as parameters when the run begins.
-
-    Raises:
-        ImportError: if mlflow is not installed.
-        ValueError: if the recorded run is not in that database.
-    """
-    mlflow = _require("mlflow")
-    from torchrl.record.loggers.mlflow import MLFlowLogger
-
-    mlflow.end_run()  # of an earlier job of a sweep in this process
-    mlflow.set_tracking_uri(tracking_uri)
-    with _one_at_a_time(tracking_uri):
-        mlflow.set_experiment(experiment)
-    record = folder / "mlflow.json"
-    if run_id := _recorded(record):
-        os.environ["MLFLOW_RUN_ID"] = run_id  # read once, when the logger starts its run
-    try:
-        logger = MLFlowLogger(experiment, tracking_uri)
-    except mlflow.exceptions.MlflowException as error:
-        raise ValueError(
-            f"tracking_uri must be where the run was logged before, and {tracking_uri} does not know it ({error}); "
-            f"remove {record} to log the rest as a new run."
-        ) from error
-    finally:
-        os.environ.pop("MLFLOW_RUN_ID", None)
-    if run_id is None:
-        _record(record, logger.experiment.info.run_id)
-        mlflow.set_tag("mlflow.runName", _name(folder))
-        logger.log_hparams(_flat(settings or {}))
-    return logger
-
-
-@contextmanager
-def _one_at_a_time(tracking_uri: str) -> Iterator[None]:
-    """MLflow fails if two processes create the same SQLite file at once, as the first jobs of a parallel sweep do."""
-    if not tracking_uri.startswith("sqlite:///"):
-        yield
-        return
-    path = Path(tracking_uri.removeprefix("sqlite:///"))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with lock(path.with_name(f"{path.name}.lock"), patience_seconds=600.0):
-        yield
-
-
-def _require(package: str) -> ModuleType:
-    """Imports an optional package."""
-    try:
-        return importlib.import_module(package)
-    except ImportError as error:
-        raise ImportError(
-            f"logger={package} needs the package {package} ({error}): pip install 'hdrqn_torchrl[{package}]'"
-        ) from error
-
-
-def _name(folder: Path) -> str:
-    return "/".join(folder.absolute().parts[-2:])
-
-
-def _recorded(path: Path) -> str | None:
-    """Id of the run at the service, if this is a resumed run."""
-    return json.loads(path.read_text())["id"] if path.exists() else None
-
-
-def _record(path: Path, run_id: str) -> None:
-    path.write_text(json.dumps({"id": run_id}) + "\n")
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings under their full names, as MLflow wants its parameters."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat

@@ -10,8 +10,8 @@ import hdrqn_torchrl
 ORDER = (
     "keys", "devices", "run_files", "stored_settings", "transforms", "envs", "modules", "objectives", "data",
     "collectors", "precision", "finite", "learner", "legs", "phases", "algorithms", "isolation", "intervals",
-    "evaluation", "serialization", "checkpoint", "interruption", "locking", "logging", "results", "estimates",
-    "claims", "grouping", "plotting", "figures", "rendering", "comparison", "trainer", "run_folder",
+    "evaluation", "serialization", "checkpoint", "interruption", "locking", "services", "logging", "results",
+    "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

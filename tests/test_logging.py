@@ -6,6 +6,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 from rich.console import Console
+from tensorboard.backend.event_processing import event_accumulator
 
 from hdrqn_torchrl.logging import (
     CSVLog,
@@ -215,6 +216,49 @@ def test_tensorboard_files_lie_in_the_run_folder(tmp_path):
     assert list((tmp_path / "tensorboard").glob("events*"))
 
 
+class TestTensorboardAfterAKill:
+    """What is done again stands there once, in order."""
+
+    def log(self, folder, steps, state=None):
+        logger, _ = run_logger(folder, loggers=[make_tensorboard_logger(folder)])
+        if state is not None:
+            logger.load_state_dict(state)
+        for step in steps:
+            logger.log(ROW | {"frames": step, "loss": 1.0 / (1 + step)})
+        return logger
+
+    def points(self, folder):
+        events = event_accumulator.EventAccumulator(str(folder / "tensorboard"))
+        return [(point.step, round(point.value, 6)) for point in events.Reload().Scalars("loss")]
+
+    def expected(self, steps):
+        return [(step, round(1 / (1 + step), 6)) for step in steps]
+
+    def test_with_a_checkpoint(self, tmp_path):
+        killed = self.log(tmp_path, range(3))
+        state = killed.state_dict()
+        assert self.points(tmp_path) == self.expected(range(3))  # a checkpoint leaves nothing unwritten
+        killed.log(ROW | {"frames": 3, "loss": 7.0})
+        killed.loggers[0].flush()
+        self.log(tmp_path, [3, 4], state).close()
+        assert self.points(tmp_path) == self.expected(range(5))
+
+    def test_before_the_first_checkpoint(self, tmp_path):
+        self.log(tmp_path, range(3)).close()
+        (tmp_path / "metrics.csv").unlink()  # as a start from the beginning does
+        self.log(tmp_path, range(2)).close()
+        assert self.points(tmp_path) == self.expected(range(2))
+
+
+def test_what_a_service_knows_is_not_logged_twice(tmp_path):
+    service = FakeLogger()
+    service.logged_until = 1_000
+    logger, _ = run_logger(tmp_path, loggers=[service])
+    for frames in (500, 1_000, 1_500):
+        logger.log(ROW | {"frames": frames})
+    assert [step for _, step in service.rows] == [1_500]
+
+
 SETTINGS = {"seed": 3, "algo": {"gamma": 0.9, "sub": {"tau": 0.5}}}
 
 
@@ -238,7 +282,8 @@ class FakeService:
         number = len(self.made)
         self.args, self.settings, self.params = args, settings, None
         self.environment = os.environ.get("MLFLOW_RUN_ID")
-        self.experiment = SimpleNamespace(info=SimpleNamespace(run_id=f"run{number}"))
+        data = SimpleNamespace(metrics={"frames": 20})  # of a run that is gone on with
+        self.experiment = SimpleNamespace(info=SimpleNamespace(run_id=f"run{number}"), data=data)
         self.made.append(self)
 
     def log_hparams(self, params):
@@ -336,6 +381,7 @@ class TestMLflow:
         assert resumed.environment == first.experiment.info.run_id and other.environment is None
         assert resumed.params is None and ("set_tag",) not in {each[:1] for each in asked}  # they can't be changed
         assert "MLFLOW_RUN_ID" not in os.environ
+        assert resumed.logged_until == 20 and not hasattr(other, "logged_until")
 
     def test_the_real_one(self, tmp_path):
         mlflow = pytest.importorskip("mlflow")
