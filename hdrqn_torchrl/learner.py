@@ -15,7 +15,14 @@ from torch import Tensor
 from torch.nn import Parameter
 from torchrl.objectives import LossModule, SoftUpdate
 
-from hdrqn_torchrl.data import FROM_STARTS, Continuity, Sampling, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data import (
+    FROM_STARTS,
+    Continuity,
+    LongerEpisodes,
+    Sampling,
+    make_sequence_buffer,
+    sample_sequences,
+)
 from hdrqn_torchrl.finite import FiniteGuard
 from hdrqn_torchrl.objectives import check_returns, target_lookahead
 from hdrqn_torchrl.precision import Precision, choose_precision, matrix_products
@@ -43,7 +50,8 @@ class LearnerSettings:
 
     Args:
         slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level). What its
-            targets need beyond them is drawn, too (:meth:`lookahead`).
+            targets need beyond them is drawn, too (:meth:`lookahead`). ``None``, for v3 only: what the task asks for
+            (see :func:`~hdrqn_torchrl.algorithms.make_v3`).
         batch_size: sequences of a minibatch.
         capacity: transitions kept in the replay memory.
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
@@ -75,7 +83,7 @@ class LearnerSettings:
         ValueError: if a value breaks its rule.
     """
 
-    slice_len: int = 8
+    slice_len: int | None = 8
     batch_size: int = 32
     capacity: int = 100_000
     frames_per_update: float = 8.0
@@ -100,10 +108,11 @@ class LearnerSettings:
 
     def __post_init__(self) -> None:
         check_returns(self.trace_decay, self.n_step)
+        slice_len = 2 if self.slice_len is None else self.slice_len
         rules = (
-            ("slice_len", self.slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
+            ("slice_len", slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
             ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
-            ("capacity", self.capacity >= self.slice_len, ">= slice_len", "use 100000 for steps, 50000 for options"),
+            ("capacity", self.capacity >= slice_len, ">= slice_len", "use 100000 for steps, 50000 for options"),
             ("frames_per_update", self.frames_per_update > 0, "> 0", "use 8"),
             ("warmup_frames", self.warmup_frames >= 0, ">= 0", "use 5000"),
             ("learning_rate", self.learning_rate > 0, "> 0", "the paper uses 0.001"),
@@ -138,7 +147,7 @@ class LearnerSettings:
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
             (
                 "slice_len",
-                not self.trace_decay or self.slice_len > 1,
+                not self.trace_decay or slice_len > 1,
                 "> 1 where trace_decay > 0",
                 "a sequence of one transition has no next target to take over",
             ),
@@ -154,8 +163,13 @@ class LearnerSettings:
 
         Args:
             trace_decay: lambda; ``None``: that of these settings.
+
+        Raises:
+            ValueError: if ``slice_len`` is ``None``.
         """
         decay = self.trace_decay if trace_decay is None else trace_decay
+        if self.slice_len is None:
+            raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
         return target_lookahead(0.0 if self.sampling in FROM_STARTS else decay, self.n_step, self.slice_len)
 
 
@@ -213,8 +227,12 @@ class Learner:
             [{"params": parameters} for _, parameters in groups], lr=settings.learning_rate, fused=True
         )
         self._set_learning_rate()
+        if settings.slice_len is None:
+            raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
         lookahead = getattr(loss, "lookahead", 0)
         self._sequence_len = settings.slice_len + lookahead
+        from_starts = settings.sampling in FROM_STARTS and (episode_len is None or episode_len > settings.slice_len)
+        self._longer = LongerEpisodes(settings.slice_len) if from_starts else None
         self.buffer = make_sequence_buffer(
             settings.capacity,
             slice_len=settings.slice_len,
@@ -261,8 +279,20 @@ class Learner:
         transitions = self.extract(batch)
         if transitions is not None:
             self.buffer.extend(transitions)
+            self._warn_of_longer_episodes(transitions)
         if self._frames_owed > 0 and (self.held or not self._can_draw()):
             self._warm_at += math.ceil(self._frames_owed)
+
+    def _warn_of_longer_episodes(self, transitions: TensorDictBase) -> None:
+        """Says once that an episode has transitions that no sequence from its start will ever show."""
+        if self._longer is not None and self._longer.seen(transitions):
+            self._longer = None
+            warnings.warn(
+                f"slice_len should cover an episode with sampling={self.settings.sampling!r}, got "
+                f"{self.settings.slice_len} where one has more transitions; the later ones are never learned from: "
+                "raise slice_len, or use sampling='steps' with stored_state=True.",
+                stacklevel=3,
+            )
 
     @property
     def _frames_owed(self) -> float:

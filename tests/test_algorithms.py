@@ -1,5 +1,6 @@
 import math
 from copy import deepcopy
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -166,6 +167,63 @@ class TestBoundsOfTargets:
         assert self.bound(build("v2", env), "meta") == 20.0
         loss = build("v3", env).learners["joint"].loss
         assert (loss.min_meta_target, loss.max_meta_target) == (-5.0, 20.0)
+
+
+class TestSequencesOfV3:
+    """Unless it is told, v3 takes their length from the task."""
+
+    def settings(self, env, **changes):
+        return make_v3(env, compact_network(8, (8,)), learner=replace(V3_LEARNER, **changes)).learners["joint"].settings
+
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    @pytest.mark.parametrize("steps", [1, 50, 200])
+    def test_they_are_whole_episodes_of_up_to_200_steps(self, steps, sampling):
+        settings = self.settings(small_env(2, max_steps=steps), sampling=sampling)
+        assert (settings.slice_len, settings.sampling, settings.stored_state) == (steps, sampling, False)
+
+    @pytest.mark.parametrize("env", [small_env(2, max_steps=201), Corridor(2, length=6)], ids=["long", "unknown"])
+    def test_of_longer_episodes_they_are_short_and_begin_anywhere_from_stored_states(self, env):
+        with pytest.warns(UserWarning, match=r"sequences of 32 steps that begin anywhere, .* give slice_len to have"):
+            settings = self.settings(env)
+        assert (settings.slice_len, settings.sampling, settings.stored_state) == (32, "steps", True)
+        assert settings.burn_in == 0.25
+
+    def test_what_is_given_is_kept(self):
+        env = small_env(2, max_steps=400)
+        assert self.settings(env, slice_len=50) == replace(V3_LEARNER, slice_len=50)
+        given = {"sampling": "steps", "stored_state": True, "burn_in": 0.5}
+        assert self.settings(env, **given) == replace(V3_LEARNER, slice_len=32, **given)
+        with pytest.raises(
+            ValueError, match=r"slice_len must be a number with .*'whole_episodes' and .* up to 400 steps"
+        ):
+            self.settings(env, sampling="whole_episodes")
+
+    def test_of_episodes_of_400_steps_every_one_is_trained(self):
+        """Of a memory of two episodes in each environment, in step: which steps enter the loss?"""
+        env = Corridor(4, length=400, task=Task(max_steps=400))
+        torch.manual_seed(0)
+        settings = replace(V3_LEARNER, capacity=4 * 850, batch_size=64, warmup_frames=0)
+        with pytest.warns(UserWarning, match=r"of up to 400 steps in sequences of 32 steps"):
+            algorithm = make_v3(env, compact_network(8, (8,)), learner=settings, memory_size=8, head_size=8)
+        learner = algorithm.learners["joint"]
+        for batch in collect(algorithm, env, 50, batches=16):
+            learner.store(batch)
+        counts = torch.zeros(400)
+        for _ in range(16):
+            sample = learner.sample()
+            sample["subgoal_mask"].fill_(True)  # both ends are soon attained, and nothing is left to learn about
+            loss, valid = learner.loss, sample["collector", "mask"][:, :-1]
+            events = loss._events(sample[:, :-1], sample["collector", "mask"])
+            trained = loss._trained(sample, valid, events, torch.ones_like(events["attained"]))[0].any(-1)
+            assert (trained.sum(-1) <= 32).all()
+            counts += (sample["index"][:, :-1, 0] % 400)[trained].bincount(minlength=400)
+        assert (counts[:399] > 0).all() and counts[50:].sum() > 6 * counts[:50].sum()
+
+
+def test_the_others_need_a_number():
+    for name in ("drqn", "v1", "v2"):
+        with pytest.raises(ValueError, match="slice_len must be a number, got None; only v3 asks the task"):
+            build(name, small_env(2), settings=tiny_settings(slice_len=None))
 
 
 class TestTasksWithoutEnd:
@@ -669,7 +727,7 @@ class TestV3:
     def test_the_default_learner(self):
         assert V3_LEARNER.sampling == "episode_starts"
         algorithm = make_v3(small_env(2), NETWORKS["compact"])
-        assert algorithm.learners["joint"].settings is V3_LEARNER
+        assert algorithm.learners["joint"].settings == replace(V3_LEARNER, slice_len=7)  # the steps of an episode
 
     def test_a_restored_learner_goes_on_alike(self):
         algorithm, batch = self.steps()

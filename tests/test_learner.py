@@ -146,6 +146,37 @@ class TestWhatCanNotBeDrawnYet:
         assert found == [2, 0, 0, 2, 2]
 
 
+class TestEpisodesThatAreLongerThanASequence:
+    def warnings_of(self, *, batch_len=4, **settings):
+        learner, steps = make_learner(**settings), make_batch(time=24)
+        steps["is_init"] = (torch.arange(24) % 8 == 0).expand(2, 24).unsqueeze(-1).clone()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            for start in range(0, 24, batch_len):
+                learner.store(steps[:, start : start + batch_len])
+        return [str(each.message) for each in caught if "slice_len should cover" in str(each.message)]
+
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    @pytest.mark.parametrize("batch_len", [1, 3, 24])
+    def test_it_is_said_once_that_their_later_steps_are_never_learned_from(self, sampling, batch_len):
+        (said,) = self.warnings_of(sampling=sampling, slice_len=7, batch_len=batch_len)
+        assert f"with sampling={sampling!r}, got 7 where one has more transitions; the later ones are never" in said
+
+    @pytest.mark.parametrize(
+        "settings",
+        [
+            {"sampling": "episode_starts", "slice_len": 8},
+            {"sampling": "whole_episodes", "slice_len": 8, "batch_len": 3},
+            {"sampling": "steps", "slice_len": 2},
+            {"sampling": "episodes", "slice_len": 2},
+            {"sampling": "episode_starts", "slice_len": 8, "episode_len": 8},
+        ],
+        ids=str,
+    )
+    def test_nothing_is_said_where_all_steps_are_shown(self, settings):
+        assert self.warnings_of(**settings) == []
+
+
 class TestUpdate:
     def test_it_reduces_the_loss_on_a_fixed_sample(self):
         learner = make_learner(learning_rate=1e-2, tau=1e-6)

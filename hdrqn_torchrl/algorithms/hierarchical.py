@@ -291,7 +291,7 @@ def _held_options(task: Task, meta: LearnerSettings) -> int:
     """
     if task.max_steps is not None and task.max_steps <= LONGEST_HELD_EPISODE:
         return LONGEST_HELD_EPISODE
-    return 8 * (meta.slice_len + meta.lookahead())
+    return 8 * ((meta.slice_len or 1) + meta.lookahead())
 
 
 @torch.no_grad()

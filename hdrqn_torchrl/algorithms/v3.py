@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
@@ -9,6 +12,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
+from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learner import Learner, LearnerSettings
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
@@ -24,7 +28,7 @@ from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 V3_LEARNER = LearnerSettings(
-    slice_len=50,
+    slice_len=None,
     capacity=200_000,
     frames_per_update=20,
     warmup_frames=10_000,
@@ -33,7 +37,11 @@ V3_LEARNER = LearnerSettings(
     max_grad_norm=10.0,
     sampling="episode_starts",
 )
-"""Defaults of :func:`make_v3`, for episodes of 50 steps."""
+"""Defaults of :func:`make_v3`."""
+LONGEST_SEQUENCE = 200
+"""Steps of the longest episode that v3 replays as a whole unless it is told to."""
+SHORT_SEQUENCE = 32
+"""Steps of v3's sequences that begin anywhere, unless it is told; so it learned Montezuma's Revenge."""
 
 
 def make_v3(
@@ -69,6 +77,9 @@ def make_v3(
         architecture: where the features come from.
         learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
             should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
+            ``slice_len=None``: a whole episode as the task states it, up to 200 steps; where it may be longer, or the
+            task does not say, ``"episode_starts"`` becomes sequences of 32 steps from anywhere (``sampling="steps"``,
+            with ``stored_state`` and a ``burn_in`` of 0.25).
         sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
         phase_one: how long subgoals are chosen at random (the meta level learns meanwhile, as its head learns from
             every step); ``None``: not at all.
@@ -118,6 +129,7 @@ def make_v3(
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
     meta_rate = learner.learning_rate if meta_learning_rate is None else meta_learning_rate
     has = check_environment(env, architecture, builder="make_v3", subgoals=True)
+    learner = _with_sequences(learner, has.task)
     observation, num_actions, num_subgoals = has.observation, has.num_actions, has.num_subgoals
     for name, size, usual in (("memory_size", memory_size, 128), ("head_size", head_size, 128)):
         check_size(name, size, usual)
@@ -194,3 +206,30 @@ def make_v3(
         make_transforms=copies_of(InitTracker(), subgoals, policy.make_tensordict_primer()),
         phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, None),
     )
+
+
+def _with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
+    """The settings with sequences as the task needs them, unless they say themselves how long these are.
+
+    Raises:
+        ValueError: if whole episodes are asked for and may be very long.
+    """
+    if learner.slice_len is not None:
+        return learner
+    if learner.sampling not in FROM_STARTS:
+        return replace(learner, slice_len=SHORT_SEQUENCE)
+    if task.max_steps is not None and task.max_steps <= LONGEST_SEQUENCE:
+        return replace(learner, slice_len=task.max_steps)
+    length = "of unknown length" if task.max_steps is None else f"of up to {task.max_steps} steps"
+    if learner.sampling == "whole_episodes":
+        raise ValueError(
+            f"slice_len must be a number with sampling='whole_episodes' and episodes {length}, got None; or use "
+            "sampling='steps' with stored_state=True."
+        )
+    warnings.warn(
+        f"v3 learns from episodes {length} in sequences of {SHORT_SEQUENCE} steps that begin anywhere, from stored "
+        "states (sampling='steps', stored_state=True, burn_in=0.25); give slice_len to have them begin where an "
+        "episode does.",
+        stacklevel=3,
+    )
+    return replace(learner, slice_len=SHORT_SEQUENCE, sampling="steps", stored_state=True, burn_in=0.25)

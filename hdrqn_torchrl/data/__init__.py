@@ -3,6 +3,7 @@
 from hdrqn_torchrl.data.continuity import Continuity
 from hdrqn_torchrl.data.hindsight import HindsightOptions, relabel_subgoals
 from hdrqn_torchrl.data.history import OptionHistory, refresh_hidden
+from hdrqn_torchrl.data.lengths import LongerEpisodes
 from hdrqn_torchrl.data.options import OptionExtractor, StepSelector
 from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
 from hdrqn_torchrl.data.replay import FROM_STARTS, Sampling, SequenceBuffer, make_sequence_buffer, sample_sequences
@@ -14,6 +15,7 @@ __all__ = [
     "EpisodeSliceSampler",
     "EpisodeStartSampler",
     "HindsightOptions",
+    "LongerEpisodes",
     "OptionExtractor",
     "OptionHistory",
     "PrioritizedSequenceSampler",
