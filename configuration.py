@@ -70,6 +70,8 @@ class Schema:
     evaluation: EvaluationSchema = field(default_factory=EvaluationSchema)
     checkpoint: CheckpointSchema = field(default_factory=CheckpointSchema)
     output_root: str = MISSING
+    init_from: str | None = None
+    init_checkpoint: str = "best"
     resume: str | None = MISSING
     resume_override: bool = MISSING
     allowed_targets: list[str] = field(default_factory=list)
@@ -139,6 +141,11 @@ def check(config: DictConfig) -> None:
     if config.device not in ("auto", "cpu", "cuda"):
         raise SettingsError(
             f"device must be auto, cpu or cuda, got {config.device!r}; auto takes a GPU if there is one."
+        )
+    which = config.init_checkpoint
+    if which not in ("best", "last"):
+        raise SettingsError(
+            f"init_checkpoint must be best or last, got {which!r}; init_from=CHECKPOINT names any other."
         )
     replay = config.checkpoint.replay
     if replay not in (True, False, "last"):

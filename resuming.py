@@ -34,6 +34,8 @@ class Plan:
     """Whether it goes on with a run that was begun before."""
     checkpoint: Path | None = None
     """Where it goes on; ``None``: at the run's newest checkpoint."""
+    weights: Path | None = None
+    """What it begins with instead of random weights."""
 
 
 def plan(config: DictConfig, folder: Path) -> Plan:
@@ -195,6 +197,7 @@ def record(run: Plan) -> None:
             "choices": run.choices,
             "overrides": list(HydraConfig.get().overrides.task),
             "command": " ".join(sys.argv),
+            "init_from": None if run.weights is None else str(run.weights),
             "commit": _commit(),
             "versions": {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")},
         }

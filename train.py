@@ -9,6 +9,7 @@ import random
 import sys
 import traceback
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -123,6 +124,7 @@ def note_error(folder: Path) -> None:
 def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
     from hdrqn_torchrl.checkpoint import Checkpoints
+    from hdrqn_torchrl.transfer import find_weights, load_weights_of, start_from
 
     checkpoints = Checkpoints(run.folder / "checkpoints")
     checkpoints.clean_up()  # first: it may bring back the newest
@@ -133,6 +135,11 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     trainer, evaluation_env, references = build_run(run)
     if start is not None:
         trainer.resume(start)
+    elif run.config.init_from is not None:
+        path = find_weights(Path(run.config.init_from), run.config.init_checkpoint)
+        start_from(trainer.algorithm, load_weights_of(path))
+        trainer.collector.update_policy_weights_()
+        run = replace(run, weights=path)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
     for name in ("error.txt", "summary.json", "curves.png"):
         (run.folder / name).unlink(missing_ok=True)

@@ -21,7 +21,7 @@ from typing import Any, Literal
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import nn
+from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
 
 from hdrqn_torchrl.serialization import SafetensorsAdapter
@@ -301,18 +301,26 @@ def load_weights(module: nn.Module, path: Path) -> None:
     Raises:
         ValueError: if there is no such file, it is of another kind, or it does not fit the module.
     """
+    try:
+        module.load_state_dict(read_weights(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """What :func:`save_weights` wrote, by name.
+
+    Raises:
+        ValueError: if there is no such file, or it is of another kind.
+    """
     if not path.is_file():
         raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
     try:
-        weights = load_file(path)
+        return load_file(path)
     except SafetensorError as error:
         raise ValueError(
             f"{path} must be a safetensors file, got something else ({error}); see checkpoints/."
         ) from error
-    try:
-        module.load_state_dict(weights)
-    except RuntimeError as error:
-        raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
 
 
 def _checksum(path: Path) -> list[int]:

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torch.nn import Parameter
-from torchrl.objectives import LossModule, SoftUpdate
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import (
     FROM_STARTS,
@@ -369,6 +369,10 @@ class Learner:
             if len(groups) > 1:
                 norm = torch.nn.utils.get_total_norm([each.grad for each in parameters if each.grad is not None])
             torch.nn.utils.clip_grads_with_norm_(parameters, largest, norm)
+
+    def copy_to_target(self) -> None:
+        """Makes the target network the same as the one that is trained."""
+        HardUpdate(self.loss, value_network_update_interval=1).step()
 
     def check_finite(self) -> None:
         """Looks at all updates since the last call, on devices where :meth:`update` does not look at each.

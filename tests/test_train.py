@@ -14,12 +14,14 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import torch
 from helpers import check_same_checkpoint, make_collector, table
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from processes import leftovers, limit_file_size, limited_file_size, run_script, start_script
+from safetensors.torch import load_file
 
 import train
 from hdrqn_torchrl.checkpoint import verify
@@ -326,6 +328,35 @@ class TestGoingOnWithAFinishedRun:
         assert code == 0, told
         assert table(a_run) == table(finished / "run")
         check_same_checkpoint(a_run, finished / "run")
+
+
+class TestBeginningWithOtherWeights:
+    def begin(self, folder, *arguments):
+        return run_script(folder, *SHORT, "seed=7", "env.max_steps=20", "hydra.run.dir=new", *arguments)
+
+    def weights(self, path):
+        return load_file(next(path.glob("components/*-policy")) / "tensors.safetensors")
+
+    def test_of_a_run_on_another_task(self, a_run):
+        slow = ["total_frames=512", "algo.sub.learning_rate=1e-12", "algo.meta.learning_rate=1e-12"]
+        slow += ["algo.sub.learning_rate_end=null", "algo.meta.learning_rate_end=null"]
+        code, _, told = self.begin(a_run.parent, "init_from=run", "init_checkpoint=last", *slow)
+        assert code == 0, told
+        source, new = a_run / "checkpoints" / "checkpoint-000000001024", a_run.parent / "new"
+        before, after = self.weights(source), self.weights(new / "checkpoints" / "checkpoint-000000000512")
+        assert (after["sub_controller.exploration.frames"], before["sub_controller.exploration.frames"]) == (512, 1024)
+        for name in set(before) - {each for each in before if "exploration" in each}:
+            assert torch.allclose(before[name], after[name], atol=1e-6), name
+        assert json.loads((new / "run.json").read_text())["init_from"] == str(source.relative_to(a_run.parent))
+        assert table(new)[0]["updates"] == "0" and OmegaConf.load(new / "config.yaml").init_from == "run"
+        shutil.rmtree(a_run)  # a run that has begun does not need it any more
+        code, _, told = run_script(a_run.parent, "resume=new", "total_frames=640")
+        assert code == 0, told
+
+    def test_that_do_not_fit(self, a_run):
+        code, _, told = self.begin(a_run.parent, "init_from=run", "env.view=3")
+        assert code == 1 and "Traceback" not in told
+        assert "error: init_from must hold the weights of an agent with the same networks, got others: " in told
 
 
 class TestWhatIsLeftAlone:
