@@ -10,12 +10,21 @@ from torch import Tensor
 
 from hdrqn_torchrl import keys
 
+_READ = (
+    keys.IS_INIT,
+    keys.OPTION_INIT,
+    keys.ATTAINED,
+    *(("next", key) for key in (keys.ATTAINED, keys.ACTIVE_SUBGOAL, keys.OPTION_DONE, keys.SUBGOAL_REACHED)),
+)
+
 
 class LegCounter:
     """Counts options by the subgoal that was attained last when they began, and by the one they pursued.
 
     Row G stands for the start of an episode. Where an episode begins at a subgoal (practice), ``attained`` of its
     reset says so.
+
+    It counts on the host, wherever the steps lie.
 
     Args:
         num_subgoals: G.
@@ -43,7 +52,7 @@ class LegCounter:
 
     def add(self, batch: TensorDictBase) -> None:
         """Takes a collected batch ``[N, T]``."""
-        for step in batch.unbind(1):
+        for step in batch.select(*_READ).cpu().unbind(1):
             self.add_step(step)
 
     def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
@@ -53,6 +62,7 @@ class LegCounter:
             step: of all environments.
             counted: in which of them options that end count, ``[N]`` bool; ``None``: in all.
         """
+        step = step.select(*_READ).cpu()
         start, after = torch.tensor(self.num_subgoals), step.get("next")
         if self._place is None or self._origin is None:
             self._place = self._origin = start.expand(step.batch_size)
@@ -82,5 +92,6 @@ class LegCounter:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
-        self.options, self.reached = state["options"].clone(), state["reached"].clone()
-        self._place, self._origin = state["place"], state["origin"]
+        options, reached, place, origin = (state[name] for name in ("options", "reached", "place", "origin"))
+        self.options, self.reached = options.cpu().clone(), reached.cpu().clone()
+        self._place, self._origin = (None if each is None else each.cpu() for each in (place, origin))

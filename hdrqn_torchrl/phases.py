@@ -71,7 +71,7 @@ class Phases:
     def observe(self, batch: TensorDictBase) -> None:
         """Takes note of a collected batch ``[N, T]``, and begins the second phase when it is time."""
         self.success.observe(batch)
-        self.legs.add(batch.cpu())
+        self.legs.add(batch)
         self.frames += batch.numel()
         if self.phase == 1:
             tried = (self.success.options >= self.settings.min_options).all()

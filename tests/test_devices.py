@@ -4,14 +4,17 @@ import sys
 
 import pytest
 import torch
+from elsewhere import elsewhere
 from helpers import ALGORITHMS, build, collect, make_training, small_env, subgoal_env, tiny_settings
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 from waits import HostWaits
 
 from hdrqn_torchrl import learner as learner_module
+from hdrqn_torchrl.envs import MontezumaEnv
 from hdrqn_torchrl.envs.grid_rules import GridState
 from hdrqn_torchrl.evaluation import evaluate
+from hdrqn_torchrl.legs import LegCounter
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
 from hdrqn_torchrl.transforms.window import resized
 
@@ -308,3 +311,46 @@ class TestOnAGPU:
             for learner in algorithm.learners.values():
                 learner.store(batch)
                 assert learner.update(learner.sample())["loss"].isfinite()
+
+
+class TestWhatLivesOnTheHost:
+    """A checkpoint is loaded with all of its tensors on the GPU; what works on the host takes its own back."""
+
+    def test_the_stand_in_is_as_awkward_as_a_gpu(self):
+        there = elsewhere({"a": [torch.arange(3)]})["a"][0]
+        with pytest.raises(TypeError, match="to numpy"):
+            there.numpy()
+        with pytest.raises(RuntimeError, match="on the same device"):
+            there + torch.arange(3)
+        assert (there + 1).cpu().numpy().tolist() == [1, 2, 3]
+
+    def test_legs(self):
+        algorithm, env = make("v2")
+        batches = collect(algorithm, env, 6, batches=2)
+        legs, other = LegCounter(2), LegCounter(2)
+        legs.add(batches[0])
+        other.load_state_dict(elsewhere(legs.state_dict()))
+        for each in (legs, other):
+            each.add(batches[1])
+        assert torch.equal(other.options, legs.options) and legs.options.sum() > 20
+
+    def test_priorities(self):
+        env = small_env(8)
+        algorithm = build("drqn", env, settings=tiny_settings(priority_exponent=0.9))
+        learner = algorithm.learners["flat"]
+        learner.store(collect(algorithm, env, 10)[0])
+        learner.update(learner.sample())
+        sampler = learner.buffer._sampler
+        state = sampler.state_dict()
+        sampler.load_state_dict(elsewhere(state))
+        for name in ("priorities", "starts"):
+            assert torch.equal(sampler.state_dict()[name], state[name])
+        learner.update(learner.sample())
+
+    def test_emulators(self):
+        pytest.importorskip("ale_py")
+        env, other = (MontezumaEnv(2, seed=seed, practice=0.5) for seed in (0, 1))
+        env.rollout(3)
+        other.load_state_dict(elsewhere(env.state_dict()))
+        actions = [TensorDict(action=torch.tensor([3, 4]), batch_size=2) for _ in range(3)]
+        assert all((env.step(td.clone()) == other.step(td.clone())).all() for td in actions)

@@ -169,12 +169,13 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         Raises:
             ValueError: if it is of another capacity, or holds what is no priority.
         """
-        self._check_state(state_dict["priorities"], state_dict["starts"], state_dict["largest"])
+        priorities, starts = (state_dict[name].cpu() for name in ("priorities", "starts"))  # where the trees are
+        self._check_state(priorities, starts, state_dict["largest"])
         self._empty()
-        self._starts = state_dict["starts"].clone()
+        self._starts = starts.clone()
         known = self._starts.nonzero().squeeze(-1)
         if len(known):
-            self._sum_tree[known] = self._min_tree[known] = state_dict["priorities"][known]
+            self._sum_tree[known] = self._min_tree[known] = priorities[known]
         if state_dict["largest"] is not None:
             self._max_priority = (torch.tensor(state_dict["largest"]), None)
 

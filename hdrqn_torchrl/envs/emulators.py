@@ -35,7 +35,7 @@ class Snapshot(NamedTuple):
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, Tensor]) -> Snapshot:
         """What :meth:`tensors` was called on."""
-        state, ram, screen = (tensors[name].numpy() for name in cls._fields)
+        state, ram, screen = (tensors[name].cpu().numpy() for name in cls._fields)
         return cls(state.tobytes(), ram.copy(), screen.copy())
 
 

@@ -283,7 +283,7 @@ class MontezumaEnv(EnvBase):
         for index, moment in enumerate(state_dict["emulators"]):
             self.emulators.restore(index, Snapshot.of_tensors(moment))
         self._practice_starts.load_state_dict(state_dict["practice_starts"])
-        self.steps, self._inside = state_dict["steps"].numpy().copy(), state_dict["inside"].numpy().copy()
+        self.steps, self._inside = (state_dict[name].cpu().numpy().copy() for name in ("steps", "inside"))
         self.total_steps = state_dict["total_steps"]
         self._generator.bit_generator.state = state_dict["generator"]
 
