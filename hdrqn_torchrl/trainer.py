@@ -128,11 +128,11 @@ class Trainer:
     def _receive(self, batch: TensorDictBase) -> None:
         """Counts and stores a collected batch ``[N, T]``."""
         check_finite(batch, self.frames)
+        self.algorithm.observe(batch)
         self.frames += batch.numel()
         finished = self._tracker.finished(batch)
         self.episodes += len(finished)
         self._window.add_episodes(finished)
-        self.algorithm.observe(batch)
 
     def _complete_iteration(self) -> None:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""

@@ -6,7 +6,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
 from user_envs import Corridor
 
-from hdrqn_torchrl.envs import Task, goals_in_order, task_of
+from hdrqn_torchrl.envs import GoalsInOrder, Task, task_of
 from hdrqn_torchrl.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round, summarise
 from hdrqn_torchrl.legs import LegCounter
 
@@ -44,7 +44,7 @@ class TestEvaluate:
     def test_every_environment_plays_equally_often(self, episodes, played):
         assert evaluate(pair_env(4), always_right(), episodes=episodes)["episodes"] == played
 
-    def test_half_of_the_goals_in_order_is_a_rate_of_one_half(self):
+    def test_half_of_the_GoalsInOrder_is_a_rate_of_one_half(self):
         """In a row of three cells, one who starts on the left and goes right takes both goals, in either order."""
         env = small_env(300, layout=("#####", "#   #", "#####"), num_obstacles=0, max_steps=2, view=5)
         env.set_seed(3)
@@ -177,7 +177,7 @@ class TestEpisodeTracker:
 class TestTasksOfOthers:
     """A user's environment has fewer entries, and its episodes may be long or have no end."""
 
-    STATED = Task(max_steps=6, in_order=goals_in_order(2))
+    STATED = Task(max_steps=6, in_order=GoalsInOrder(2))
 
     def played(self, name="v2", **settings):
         env = Corridor(4, **settings)
@@ -202,7 +202,7 @@ class TestTasksOfOthers:
         assert set(result) == set(result["intervals"]) | {"episodes", "per_subgoal", "intervals"}
         assert len(result["per_subgoal"]) == (0 if name == "dqn" else 2)
 
-    def test_large_rewards_are_no_goals_in_order(self):
+    def test_large_rewards_are_no_GoalsInOrder(self):
         """Ten a goal, and many of them: the rate was 13.5 once."""
         result = self.played(pays=27.0, without=("success",))
         assert "in_order_rate" not in result

@@ -9,17 +9,27 @@ import torch
 from helpers import ALGORITHMS, build, collect, small_env
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, Unbounded
 from torchrl.envs import DTypeCastTransform, GymWrapper, ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
-from user_envs import Corridor
+from user_envs import Corridor, Walk
 
 from hdrqn_torchrl.algorithms import make_v3
 from hdrqn_torchrl.modules import Architecture, FullyConnectedFeatures, compact_network
 
 EVERY = [*ALGORITHMS, "v3"]
 N = 4
+PLAIN = Architecture(
+    hidden_size=8,
+    observation_features=lambda spec: FullyConnectedFeatures(spec.shape[-1], (8,)),
+    vector_features=lambda size: FullyConnectedFeatures(size, (8,)),
+)
 
 
 def cart_pole(**settings):
     return GymWrapper(gymnasium.make("CartPole-v1"), **settings)
+
+
+def walk(*, in_info, read=False):
+    env = GymWrapper(Walk(in_info=in_info), categorical_action_encoding=True)
+    return env.auto_register_info_dict() if read else env
 
 
 def refusal(name, env):
@@ -112,15 +122,59 @@ class TestObservations:
             assert torch.isfinite(learner.update(learner.sample())["loss"])
 
     def test_an_architecture_of_one_s_own_reads_what_it_wants(self):
-        plain = Architecture(
-            hidden_size=8,
-            observation_features=lambda spec: FullyConnectedFeatures(spec.shape[-1], (8,)),
-            vector_features=lambda size: FullyConnectedFeatures(size, (8,)),
-        )
         env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
-        algorithm = build("v2", env, plain)
+        algorithm = build("v2", env, PLAIN)
         algorithm.observe(collect(algorithm, env, 16)[0])
         assert torch.isfinite(algorithm.learners["sub"].update(algorithm.learners["sub"].sample())["loss"])
+
+    @pytest.mark.parametrize("name", ["drqn", "v2", "v3"])
+    def test_what_cannot_be_guessed_is_not_predicted(self, name):
+        env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
+        with pytest.raises(ValueError, match=r"prediction_steps must be 0 where .*, got 3 for \[4, 4\]"):
+            build(name, env, PLAIN, prediction_steps=3)
+        build(name, env, PLAIN, prediction_steps=0)
+
+
+class TestGymnasium:
+    """Several ways in which Gymnasium tells of subgoals, and what TorchRL makes of them."""
+
+    def walks(self, kind):
+        if kind == "info":
+            return SerialEnv(2, partial(walk, in_info=True, read=True))
+        if kind == "dictionary":
+            return SerialEnv(2, partial(walk, in_info=False))
+        mode, in_info = gymnasium.vector.AutoresetMode[kind.split()[0]], kind.endswith("info")
+        vector = gymnasium.vector.SyncVectorEnv([partial(Walk, in_info=in_info)] * 2, autoreset_mode=mode)
+        env = GymWrapper(vector, categorical_action_encoding=True)
+        return env.auto_register_info_dict() if in_info else env
+
+    @pytest.mark.parametrize("kind", ["info", "dictionary", "DISABLED", "DISABLED info"])
+    @pytest.mark.parametrize("name", ["v2", "v3"])
+    def test_these_are_learned_from(self, name, kind):
+        env = self.walks(kind)
+        algorithm = build(name, env, PLAIN, prediction_steps=0)
+        assert algorithm.learners and not algorithm.task.in_order
+        for batch in collect(algorithm, env, 9, 2):
+            algorithm.observe(batch)
+            assert (batch["next", "attained"].any(-1, keepdim=True) == (batch["next", "extrinsic_reward"] == 1)).all()
+            assert batch["next", "attained"].any() and batch["next", "option_done"][batch["next", "done"]].all()
+        for learner in algorithm.learners.values():
+            assert torch.isfinite(learner.update(learner.sample())["loss"])
+
+    def test_vectors_that_reset_themselves_in_the_same_step_are_for_plain_observations(self):
+        message = refusal("v2", self.walks("SAME_STEP"))
+        assert "got autoreset_mode=SAME_STEP; use AutoresetMode.DISABLED" in message
+        vector = gymnasium.make_vec(
+            "CartPole-v1", 2, "sync", {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+        )
+        env = GymWrapper(vector, categorical_action_encoding=True)
+        algorithm = build("drqn", env, PLAIN)
+        batch = collect(algorithm, env, 60)[0]
+        algorithm.observe(batch)
+        done, start = batch["next", "done"][:, :-1], batch["is_init"][:, 1:]
+        assert done.any() and (done == start).all()
+        assert batch["next", "observation"][batch["next", "terminated"].squeeze(-1)].abs().amax(-1).min() > 0.2
+        assert batch["observation"][batch["is_init"].squeeze(-1)].abs().max() <= 0.05  # CartPole's starts
 
 
 class TestEntries:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import gymnasium
+import numpy as np
 import torch
+from gymnasium import spaces
 from tensordict import TensorDict
 from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
@@ -101,3 +104,31 @@ class Corridor(EnvBase):
         wanted = {key: spec for each in specs for key, spec in each.items()}
         outcome = {key: spec.rand() if key in self.odd else values[key] for key, spec in wanted.items()}
         return TensorDict(outcome, self.batch_size)
+
+
+class Walk(gymnasium.Env):
+    """The corridor for Gymnasium, seen as a vector; what else there is stands in the observation or in ``info``."""
+
+    def __init__(self, *, in_info: bool) -> None:
+        self.in_info = in_info
+        view, flags = spaces.Box(0, 1, (4,), np.float32), spaces.Box(0, 1, (2,), np.bool_)
+        entries = {"observation": view, "attained": flags, "extrinsic_reward": spaces.Box(0, 1, (1,), np.float32)}
+        self.observation_space = view if in_info else spaces.Dict(entries)
+        self.action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.steps = CELLS // 2, 0
+        return self._told([False, False])
+
+    def step(self, action):
+        before, self.steps = self.place, self.steps + 1
+        self.place = int(np.clip(self.place + 2 * action - 1, 0, CELLS - 1))
+        ends = [self.place == 0 != before, self.place == CELLS - 1 != before]
+        observation, info = self._told(ends)
+        return observation, float(any(ends)), False, self.steps >= 6, info
+
+    def _told(self, ends):
+        view = np.array([self.place / CELLS, self.steps / 6, 0, 1], np.float32)
+        others = {"attained": np.array(ends), "extrinsic_reward": np.array([any(ends)], np.float32)}
+        return (view, others) if self.in_info else ({"observation": view, **others}, {})

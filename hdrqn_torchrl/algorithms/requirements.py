@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from tensordict import NestedKey
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymWrapper
+from torchrl.envs.transforms import TransformedEnv
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs import Task, task_of
@@ -70,6 +71,7 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
     """
     entries = Entries.of(env)
     _check_batch(entries)
+    _check_resets(env, entries)
     _check_observation(entries, architecture)
     _check_action(entries)
     for key in (keys.DONE, keys.TERMINATED):
@@ -105,6 +107,21 @@ def _check_batch(entries: Entries) -> None:
         entries.problems.append(f"the batch size must be [N], got {list(entries.batch_size)}; {remedy}")
 
 
+def _check_resets(env: EnvBase, entries: Entries) -> None:
+    """TorchRL reads what Gymnasium's vectors report of a last step in SAME_STEP mode for plain observations only."""
+    observed = set(env.observation_spec.keys(True, True))
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    if not isinstance(env, GymWrapper):
+        return
+    mode = (env._env.metadata or {}).get("autoreset_mode")
+    if getattr(mode, "name", None) == "SAME_STEP" and observed != {keys.OBSERVATION}:
+        entries.problems.append(
+            "a vector of Gymnasium environments with more entries than the observation must leave resets to TorchRL, "
+            "got autoreset_mode=SAME_STEP; use AutoresetMode.DISABLED"
+        )
+
+
 def _check_observation(entries: Entries, architecture: Architecture) -> None:
     spec = entries.specs.get(keys.OBSERVATION)
     if spec is None:
@@ -112,7 +129,8 @@ def _check_observation(entries: Entries, architecture: Architecture) -> None:
         return
     problem = architecture.observation_problem(spec, spec.shape[len(entries.batch_size) :])
     if problem is not None:
-        entries.problems.append(f"{keys.OBSERVATION!r} {problem}, got {describe(spec)}")
+        rule, remedy = problem
+        entries.problems.append(f"{keys.OBSERVATION!r} must be {rule}, got {describe(spec)}; {remedy}")
 
 
 def _check_action(entries: Entries) -> None:

@@ -11,18 +11,18 @@ from hdrqn_torchrl.envs.scripted import (
     play_episodes,
     scripted_ceiling,
 )
-from hdrqn_torchrl.envs.task import Task, goals_in_order, task_of
+from hdrqn_torchrl.envs.task import GoalsInOrder, Task, task_of
 
 __all__ = [
     "EgocentricSearch",
     "FullInformationPlanner",
+    "GoalsInOrder",
     "MontezumaEnv",
     "MultiGoalGridEnv",
     "PerfectMemorySearch",
     "Task",
     "UniformRandom",
     "ceiling",
-    "goals_in_order",
     "make_montezuma",
     "play_episodes",
     "scripted_ceiling",

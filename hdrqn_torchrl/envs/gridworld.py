@@ -16,7 +16,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid_rules import ACTIONS, GridRules, GridState, StepEvents
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
-from hdrqn_torchrl.envs.task import Task, goals_in_order
+from hdrqn_torchrl.envs.task import GoalsInOrder, Task
 
 
 class MultiGoalGridEnv(EnvBase):
@@ -95,7 +95,7 @@ class MultiGoalGridEnv(EnvBase):
             largest_return=float(num_goals),
             largest_extrinsic_return=float(num_goals),
             smallest_extrinsic_return=0.0,
-            in_order=goals_in_order(num_goals),
+            in_order=GoalsInOrder(num_goals),
         )
         self._make_specs()
         self._generator = torch.Generator(device)

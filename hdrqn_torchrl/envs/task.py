@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 from tensordict import TensorDictBase
 from torch import Tensor
+from torch.nn import Module
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.transforms import StepCounter, TransformedEnv
@@ -65,7 +65,8 @@ class Task:
 def task_of(env: EnvBase) -> Task:
     """What an environment says about its task, found through transforms, wrappers and batches of environments.
 
-    The length of an episode is also read from ``StepCounter`` and from the limits of Gymnasium.
+    The length of an episode is also read from ``StepCounter`` and from the limits of Gymnasium. Behind a transform that
+    changes rewards nothing is known of their sums.
 
     Args:
         env: any environment. Of a batch of environments, the first one is built anew and asked.
@@ -77,10 +78,9 @@ def task_of(env: EnvBase) -> Task:
         20
     """
     if isinstance(env, TransformedEnv):
-        limits = [each.max_steps for each in env.transform.modules() if isinstance(each, StepCounter)]
         task = task_of(env.base_env)
-        for limit in limits:
-            task = task.within(limit)
+        for transform in env.transform.modules():
+            task = _through(transform, task)
         return task
     if isinstance(env, BatchedEnvBase):
         return _task_of_worker(env)
@@ -89,6 +89,18 @@ def task_of(env: EnvBase) -> Task:
         if isinstance(stated := getattr(source, "task", None), Task):
             return stated.within(_gymnasium_limit(wrapped))
     return Task(max_steps=_gymnasium_limit(wrapped))
+
+
+def _through(transform: Module, task: Task) -> Task:
+    """What is left of a statement behind a transform: one that changes rewards makes what was said of them void."""
+    if isinstance(transform, StepCounter):
+        task = task.within(transform.max_steps)
+    written = getattr(transform, "out_keys", [])
+    if keys.REWARD in written:
+        task = replace(task, largest_return=math.inf)
+    if keys.EXTRINSIC_REWARD in written:
+        task = replace(task, largest_extrinsic_return=math.inf, smallest_extrinsic_return=-math.inf, in_order=None)
+    return task
 
 
 def _task_of_worker(env: BatchedEnvBase) -> Task:
@@ -110,10 +122,21 @@ def _gymnasium_limit(wrapped: object) -> int | None:
     return min((limit for limit in limits if isinstance(limit, int) and limit > 0), default=None)
 
 
-def goals_in_order(num_goals: int) -> InOrder:
-    """How ``in_order`` is counted where the extrinsic reward is 1 for each of so many goals in order, else less."""
-    return partial(_full_reward_share, num_goals)
+@dataclass(frozen=True)
+class GoalsInOrder:
+    """Counts ``in_order`` where the extrinsic reward is 1 for each of so many goals in order, and less for others.
 
+    Args:
+        num_goals: how many there are.
 
-def _full_reward_share(num_goals: int, after: TensorDictBase) -> Tensor:
-    return (after.get(keys.EXTRINSIC_REWARD).squeeze(-1) >= 1.0).float() / num_goals
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> GoalsInOrder(2)(TensorDict(extrinsic_reward=torch.tensor([[1.0], [0.01]]), batch_size=2))
+        tensor([0.5000, 0.0000])
+    """
+
+    num_goals: int
+
+    def __call__(self, after: TensorDictBase) -> Tensor:
+        return (after.get(keys.EXTRINSIC_REWARD).squeeze(-1) >= 1.0).float() / self.num_goals

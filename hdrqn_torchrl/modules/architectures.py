@@ -31,15 +31,15 @@ class Architecture:
         observation_features: makes the feature extractor for an observation spec.
         vector_features: makes the feature extractor for a vector of given size (v2's meta-controller).
         gate_features: whether the subgoal scales the features beside being appended to them.
-        observation_problem: says of an observation's spec, and of its shape without the batch, what it must be if it
-            can't be read; ``None``: it can.
+        observation_problem: for an observation's spec and its shape without the batch, what it must be if it can't be
+            read, and what helps; ``None``: it can be.
     """
 
     hidden_size: int
     gate_features: bool = False
     observation_features: Callable[[TensorSpec], Features]
     vector_features: Callable[[int], Features]
-    observation_problem: Callable[[TensorSpec, Sequence[int]], str | None] = lambda spec, shape: None
+    observation_problem: Callable[[TensorSpec, Sequence[int]], tuple[str, str] | None] = lambda spec, shape: None
 
     def __post_init__(self) -> None:
         check_size("hidden_size", self.hidden_size, "64, or the paper's 256")
@@ -125,12 +125,15 @@ def compact_network(
     )
 
 
-def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> str | None:
-    """What an observation must be for :func:`paper_network` and :func:`compact_network`; ``None``: it is that.
+def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | None:
+    """What an observation must be for :func:`paper_network` and :func:`compact_network`, and what helps.
 
     Args:
         spec: its spec.
         shape: of it, without the batch.
+
+    Returns:
+        ``None`` if it can be read.
     """
     square = len(shape) >= 2 and shape[-1] == shape[-2]
     if type(spec) is Categorical and not spec.dtype.is_floating_point and len(shape) == 2 and square:
@@ -139,9 +142,10 @@ def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> str | None:
     if image and len(shape) == 3 and square and shape[-1] >= SMALLEST_IMAGE:
         return None
     return (
-        "must be a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] of "
-        f"S >= {SMALLEST_IMAGE} pixels, uint8 or float32 of about 1 (ToTensorImage, Resize and GrayScale make such "
-        "images); to read anything else, give Architecture(observation_features=...) a feature extractor for it"
+        "a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] of "
+        f"S >= {SMALLEST_IMAGE} pixels, uint8 or float32 of about 1",
+        "ToTensorImage and Resize make such images; for anything else give Architecture(observation_features=...) a "
+        "feature extractor",
     )
 
 
@@ -153,7 +157,16 @@ def is_grid(spec: TensorSpec) -> bool:
 def observation_predictor(
     spec: TensorSpec, hidden_size: int, num_actions: int, max_steps: int, width: int = 128
 ) -> ObservationPredictor:
-    """A predictor for an observation spec: it guesses cell codes, or a coarse image."""
+    """A predictor for an observation spec: it guesses cell codes, or a coarse image.
+
+    Raises:
+        ValueError: if the observation ``[N, ...]`` is neither.
+    """
+    if spec.ndim != (3 if is_grid(spec) else 4):
+        raise ValueError(
+            f"prediction_steps must be 0 where the observation is neither cell codes [V, V] nor an image, got "
+            f"{max_steps} for {list(spec.shape)}; such an observation can't be guessed."
+        )
 
     def decoder(in_features: int) -> Decoder:
         if is_grid(spec):

@@ -1,6 +1,8 @@
 """What tasks tell about themselves."""
 
+import math
 import pickle
+from dataclasses import replace
 from functools import partial
 
 import gymnasium
@@ -8,7 +10,7 @@ import pytest
 import torch
 from helpers import small_env
 from tensordict import TensorDict
-from torchrl.envs import GymWrapper, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import GymWrapper, ParallelEnv, RewardScaling, RewardSum, SerialEnv, StepCounter, TransformedEnv
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv, Task, task_of
 
@@ -52,6 +54,14 @@ class TestWhatIsFound:
 
     def test_a_step_counter_without_a_limit_says_nothing(self):
         assert task_of(TransformedEnv(cart_pole(None), StepCounter())).max_steps == 500  # CartPole's own
+
+    def test_rewards_that_a_transform_changes_are_unknown(self):
+        grid = task_of(small_env(2))
+        task = task_of(TransformedEnv(small_env(2), RewardScaling(0.0, 5.0)))
+        assert task == replace(grid, largest_return=math.inf)
+        task = task_of(TransformedEnv(small_env(2), RewardScaling(0.0, 5.0, in_keys=["extrinsic_reward"])))
+        assert task == Task(max_steps=grid.max_steps, largest_return=grid.largest_return)
+        assert task_of(TransformedEnv(small_env(2), RewardSum(["reward"], ["episode_reward"]))) == grid
 
     def test_gymnasium_s_time_limit_is_known(self):
         assert task_of(cart_pole(37)) == Task(max_steps=37)
