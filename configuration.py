@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from hydra.core.config_store import ConfigStore
 from hydra.errors import InstantiationException
@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from arguments import shown
-from building import SettingsError, build_algorithm, check_targets, explain, plain
+from building import SettingsError, build_algorithm, build_env, check_targets, explain, plain
 from hdrqn_torchrl.run_files import RunFileError, read_json
 from hdrqn_torchrl.stored_settings import read_settings
 
@@ -236,13 +236,49 @@ def load_agent(
     for key in changes:
         if key.startswith("_") or key not in config.env:
             raise SettingsError(f"env.{key} must be one of {sorted(set(config.env) - {'_target_'})}; it is none.")
+    own, allowed = config.copy(), allowed_targets or []
     config.env = plain(config.env) | changes
     try:
-        env, algorithm = build_algorithm(config, {"num_envs": num_envs, "device": "cpu"}, allowed_targets or [])
-        load_policy(algorithm.policy, folder / "checkpoints", checkpoint)
+        env, algorithm = build_algorithm(config, {"num_envs": num_envs, "device": "cpu"}, allowed)
+        try:
+            load_policy(algorithm.policy, folder / "checkpoints", checkpoint)
+        except ValueError:
+            if changes:
+                refuse_other_interface(build_env(own, {"num_envs": 1, "device": "cpu"}, allowed), env, changes)
+            raise
     except (InstantiationException, ValueError) as error:
         raise SettingsError(explain(error)) from error
     return Agent(config, algorithm.transform(env), algorithm)
+
+
+def refuse_other_interface(env: EnvBase, changed: EnvBase, changes: dict[str, Any]) -> None:
+    """Says why an agent's networks don't fit a changed task, if that is the reason."""
+    from hdrqn_torchrl.envs.specs import interface_differences
+
+    if found := interface_differences(env, changed):
+        given = " ".join(f"env.{key}={shown(value)}" for key, value in changes.items())
+        raise SettingsError(
+            f"{given} must leave what the agent sees and does as its networks were made for, but {found}; train an "
+            "agent for that task."
+        )
+
+
+def check_place(path: Path, key: str) -> None:
+    """Refuses a file that can't be written, before anything is done; makes its folder.
+
+    Args:
+        path: the file.
+        key: the setting that names it.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe = path.with_name(f".{path.name}.partial")
+        probe.touch()
+        probe.unlink()
+        if path.is_dir():
+            raise IsADirectoryError("it is a folder")
+    except OSError as error:
+        raise SettingsError(f"{key} must be a file that can be written, got {str(path)!r} ({error}).") from error
 
 
 def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
@@ -260,21 +296,28 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
     try:
         if wrong := [argument for argument in arguments if "=" not in argument]:
             raise SettingsError(f"an argument must read key=value, got {wrong[0]!r}; --help shows all of them.")
+        pairs = [argument.split("=", 1) for argument in arguments]
+        texts = {key: value for key, value in pairs if _is_text(schema, key, value)}
+        read = [f"{key}={'text' if key in texts else value}" for key, value in pairs]
         try:
-            settings = OmegaConf.merge(
-                OmegaConf.structured(schema), OmegaConf.from_dotlist(list(map(_quoted, arguments)))
-            )
+            settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.from_dotlist(read))
         except (OmegaConfBaseException, YAMLError) as error:
             known = ", ".join(each.name for each in fields(schema))
             raise SettingsError(f"{str(error).splitlines()[0]}; the settings are {known}.") from error
         if missing := OmegaConf.missing_keys(settings):
             raise SettingsError(f"{min(missing)} must be given: {min(missing)}=...; --help shows all settings.")
-        run(OmegaConf.to_object(settings))
+        run(replace(OmegaConf.to_object(settings), **texts))  # type: ignore[type-var]
     except SettingsError as error:
         sys.exit(f"error: {error}")
 
 
-def _quoted(argument: str) -> str:
-    """Lets a value begin with a glob's star, which YAML takes for an alias."""
-    key, _, value = argument.partition("=")
-    return f"{key}='{value}'" if value.startswith("*") else argument
+def _is_text(schema: type, key: str, value: str) -> bool:
+    """Whether a value is meant as it stands, and not as YAML: ``#``, ``:``, ``*`` and ``null`` are parts of names, too.
+
+    Settings of any type (``runs``, ``out``) take a text or a ``[list]``.
+    """
+    hint = get_type_hints(schema).get(key)
+    if hint is Any:
+        optional = getattr(schema, key, MISSING) is None
+        return not (value.startswith("[") and value.endswith("]")) and not (optional and value == "null")
+    return hint in (str, str | None)

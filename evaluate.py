@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import MISSING, OmegaConf
 
-from configuration import SettingsError, command_line, load_agent
+from configuration import Agent, SettingsError, check_place, command_line, load_agent
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -70,18 +70,24 @@ def main(settings: Settings) -> None:
         raise SettingsError(f"seed must be >= 0, got {settings.seed}; without it the run's summary has them.")
     if not 0.0 <= settings.epsilon <= 1.0:
         raise SettingsError(f"epsilon must lie in [0, 1], got {settings.epsilon}; 0 is greedy.")
-    result = json.dumps(evaluate_run(settings), indent=2)
-    print(result)
     if settings.out is not None:
-        try:
-            Path(settings.out).parent.mkdir(parents=True, exist_ok=True)
+        check_place(Path(settings.out), "out")
+    if settings.figures is not None:
+        check_place(Path(settings.figures) / "legs.png", "figures")
+    played, agent, observers = evaluate_run(settings)
+    result = json.dumps(played, indent=2)
+    print(result, flush=True)  # first: nothing that comes now can lose it
+    try:
+        if settings.out is not None:
             Path(settings.out).write_text(result + "\n")
-        except OSError as error:
-            raise SettingsError(f"out must be a file that can be written, got {settings.out} ({error}).") from error
+        if settings.figures is not None:
+            draw(observers, agent.env.base_env, Path(settings.figures))
+    except (OSError, ValueError) as error:
+        raise SettingsError(f"out and figures must be places that can be written to ({error}).") from error
 
 
-def evaluate_run(settings: Settings) -> dict[str, Any]:
-    """What is printed."""
+def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, Any]]:
+    """What is printed, who played, and what was counted meanwhile."""
     import torch
     from torchrl.envs import ExplorationType
 
@@ -113,10 +119,8 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
         )
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    if settings.figures is not None:
-        draw(observers, agent.env.base_env, Path(settings.figures))
     references = references_for(agent.env.base_env, tell=tell) if settings.ceilings else {}
-    return {
+    result = {
         "run": settings.run,
         "checkpoint": settings.checkpoint,
         "env": OmegaConf.to_container(agent.config.env, resolve=True),
@@ -127,6 +131,7 @@ def evaluate_run(settings: Settings) -> dict[str, Any]:
         "ceiling": ceiling_of(references),
         "references": references,
     }
+    return result, agent, observers
 
 
 def tell(sentence: str) -> None:
@@ -159,7 +164,6 @@ def draw(observers: dict[str, Any], base: EnvBase, folder: Path) -> None:
     from hdrqn_torchrl.figures import plot_legs, plot_places
     from hdrqn_torchrl.rendering import scene_of
 
-    folder.mkdir(parents=True, exist_ok=True)
     if "legs" in observers:
         legs = observers["legs"]
         plot_legs(legs.options.numpy(), legs.reached.numpy(), scene_of(base).subgoal_names, folder / "legs.png")

@@ -106,7 +106,7 @@ def check(settings: Settings) -> None:
     if not as_list(settings.out):
         raise SettingsError("out must name at least one file, got none; for example out=figure.png.")
     for name in as_list(settings.out):
-        if Path(str(name)).suffix not in ENDINGS:
+        if Path(str(name)).suffix.lower() not in ENDINGS:
             raise SettingsError(f"out must end in one of {', '.join(ENDINGS)}, got {name!r}.")
         if Path(str(name)).name == "metrics.csv":
             raise SettingsError(f"out must not have the name of a run's own data, got {name!r}; use table.csv.")
@@ -251,14 +251,14 @@ def write(tasks: list[TaskResults], panels: list[Panel], out: list[Path], settin
     """Writes all pictures and tables."""
     for path in out:
         path.parent.mkdir(parents=True, exist_ok=True)
-    pictures = [path for path in out if path.suffix != ".csv"]
+    pictures = [path for path in out if path.suffix.lower() != ".csv"]
     options: dict[str, Any] = {"panels": panels, "center": settings.center, "title": settings.title}
     if pictures and settings.kind == "bars":
         plot_bars(tasks, pictures, **options)
     elif pictures:
         plot_curves(tasks, pictures, axis=settings.x, log_x=settings.log_x, **options)
     for path in out:
-        if path.suffix == ".csv":
+        if path.suffix.lower() == ".csv":
             write_table(path, tasks, axis="final" if settings.kind == "bars" else settings.x)
 
 

@@ -88,7 +88,7 @@ def main(settings: Settings) -> None:
         raise SettingsError(f"size must be one of {', '.join(SIZES)}, got {settings.size!r}.")
     if unknown := [name for name in wanted if name not in _NAMES]:
         raise SettingsError(f"studies must be some of {', '.join(_NAMES)}, got {unknown[0]!r}.")
-    if Path(settings.out).suffix != ".md":
+    if Path(settings.out).suffix.lower() != ".md":
         raise SettingsError(f"out must end in .md, got {settings.out!r}; for example out=docs/results.md.")
     out = Path(settings.out)
     out.with_suffix("").mkdir(parents=True, exist_ok=True)

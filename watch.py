@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import MISSING
 
-from configuration import SettingsError, command_line, load_agent
+from configuration import SettingsError, check_place, command_line, load_agent
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.rendering import Frame
@@ -49,7 +49,7 @@ def main(settings: Settings) -> None:
     """Plays, then shows or writes what was played."""
     path = None if settings.out == "terminal" else Path(settings.out)
     if path is not None:
-        check_place(path)
+        check_place(path, "out")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     # torch and torchrl take seconds to load; --help does without them.
@@ -68,16 +68,6 @@ def main(settings: Settings) -> None:
         return
     with suppress(KeyboardInterrupt):  # seen enough
         play_in_terminal(frames, fps=settings.fps)
-
-
-def check_place(path: Path) -> None:
-    """Refuses a file that can't be written, before anything is loaded."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _partial(path).touch()
-        _partial(path).unlink()
-    except OSError as error:
-        raise SettingsError(f"out must be a file that can be written, got {str(path)!r} ({error}).") from error
 
 
 def record(settings: Settings) -> list[Frame]:

@@ -28,6 +28,7 @@ from hdrqn_torchrl.serialization import SafetensorsAdapter
 
 CHECKSUMS = "checksums.json"
 PREFIX, SCORE, MEMORY = "checkpoint-", "greedy_return", "memory-"
+_LONGEST_REASON = 400
 Replay = bool | Literal["last"]
 _UNSCORED = -sys.float_info.max  # the rotation wants a finite number; this one is never the best
 
@@ -131,7 +132,7 @@ class Checkpoints:
             return [name for name in components if name not in wanted]
         except CheckpointError as error:
             raise CheckpointError(
-                f"{path} does not fit; it must be loaded with the settings that it was made with.\n{error}"
+                f"{path} does not fit; it must be loaded with the settings that it was made with ({_in_a_line(error)})."
             ) from error
 
     def newest(self) -> Path | None:
@@ -211,6 +212,12 @@ def _seal(stage: Path, sums: Mapping[str, list[int]]) -> None:
     (stage / CHECKSUMS).write_text(json.dumps(sums))
     for path in (stage, *stage.rglob("*")):
         _sync(path)
+
+
+def _in_a_line(error: Exception) -> str:
+    """What was wrong first; torch lists every tensor, and shows whole memories."""
+    text = " ".join(str(error).split())
+    return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
 
 
 def _remove(path: Path) -> None:

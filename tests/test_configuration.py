@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -266,7 +267,10 @@ class TestLoadAgent:
             load_agent(run, env_changes={key: 3})
 
     def test_a_change_that_its_weights_do_not_fit(self, run):
-        with pytest.raises(SettingsError, match=r"checkpoint can't be loaded: .* does not fit; it must be"):
+        with pytest.raises(
+            SettingsError,
+            match=r"env.num_goals=3 must leave what the agent sees and does as its networks were made for, but",
+        ):
             load_agent(run, env_changes={"num_goals": 3})
 
     def test_a_change_that_breaks_a_rule(self, run):
@@ -511,6 +515,7 @@ class Settings:
     run: str = MISSING
     episodes: int = 10
     out: str | None = None
+    files: Any = None
 
 
 class TestCommandLine:
@@ -529,6 +534,18 @@ class TestCommandLine:
         assert call("run=a", "episodes=3", "out=b.gif") == Settings("a", 3, "b.gif")
         assert call("run=outputs/**", "out=*.png") == Settings("outputs/**", 10, "*.png")
 
+    @pytest.mark.parametrize(
+        "name",
+        ["a #b", "a: b", "{a", "*a", "!a", "&a", "123", "1e3", "null", "true", "~", "-", "a b", "[a", "'a", '"a"',
+         "a=b", "${oc.env:HOME}", "a, b", "%a", "@a", "`a", "|", ">", "", "2026-11-27"],
+    )  # fmt: skip
+    def test_a_name_is_taken_as_it_stands(self, call, name):
+        settings = call(f"run={name}", f"out={name}", f"files={name}")
+        assert settings == Settings(name, 10, name, None if name == "null" else name)
+
+    def test_a_setting_that_takes_several_reads_a_list(self, call):
+        assert call("run=a", "files=[a,'b #c']").files == ["a", "b #c"]
+
     @pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["run=a", "--help"]], ids=str)
     def test_help(self, call, capsys, arguments):
         with pytest.raises(SystemExit) as stop:
@@ -546,7 +563,10 @@ class TestCommandLine:
             (["episodes=3"], "error: run must be given: run=...; --help shows all settings."),
             (["run"], "error: an argument must read key=value, got 'run'; --help shows all of them."),
             (["run=a", "-v"], "error: an argument must read key=value, got '-v'; --help shows all of them."),
-            (["run=a", "episods=3"], "error: Key 'episods' not in 'Settings'; the settings are run, episodes, out."),
+            (
+                ["run=a", "episods=3"],
+                "error: Key 'episods' not in 'Settings'; the settings are run, episodes, out",
+            ),
             (["run=a", "episodes=many"], "error: Value 'many' of type 'str' could not be converted to Integer; the "),
             (["run=a", "episodes=[1"], "error: "),
         ],

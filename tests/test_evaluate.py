@@ -93,16 +93,38 @@ def test_the_object_can_be_written_to_a_file(call, tmp_path):
         (["env.veiw=3"], "env.veiw must be one of"),
         (["env._target_=os.system"], "env._target_ must be one of"),
         (["env.view=4"], "env.view must be an odd number"),
-        (["env.num_goals=3"], "size mismatch"),
+        (
+            ["env.num_goals=3"],
+            r"env.num_goals=3 must leave .*, but .*, attained is bool \[3\] instead of",
+        ),
+        (
+            ["env.view=3"],
+            r"env.view=3 must leave .*, but observation is uint8 \[3, 3\] below 5 instead",
+        ),
         (["checkpoint=nowhere"], "nowhere"),
         (["run=nowhere"], "run must be a folder that train.py wrote, got nowhere"),
         (["episodes=8", "out=/dev/null/result.json"], "out must be a file that can be written"),
+        (["episodes=8", "figures=/dev/null/figures"], "figures must be a file that can be written"),
         (["episodes"], "must read key=value, got 'episodes'"),
     ],
 )
 def test_wrong_arguments_are_told(call, arguments, part):
     with pytest.raises(SystemExit, match=part):
         call(*arguments)
+
+
+def test_results_come_before_figures_and_survive_them(run, monkeypatch, capsys, tmp_path):
+    def fail(*_):
+        raise OSError("no room")
+
+    monkeypatch.setattr(evaluate, "draw", fail)
+    arguments = [f"run={run}", "episodes=8", "ceilings=false", f"figures={tmp_path / 'a #b'}", f"out={tmp_path}/1.json"]
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments])
+    with pytest.raises(SystemExit, match=r"error: out and figures must be .* \(no room\)"):
+        command_line(evaluate.Settings, evaluate.__doc__, evaluate.main)
+    result = json.loads(capsys.readouterr().out)
+    assert result["episodes"] == 8 and json.loads((tmp_path / "1.json").read_text()) == result
+    assert result["ceiling"] is None and result["references"] == {}
 
 
 def test_help_and_missing_arguments(monkeypatch, capsys):

@@ -105,8 +105,8 @@ def test_frames_are_those_of_the_loaded_weights(run, tmp_path, command, monkeypa
 
 def test_mp4_in_a_new_folder(run, command):
     pytest.importorskip("av")
-    command(f"run={run}", "out=new/folder/episode.mp4", "episodes=1")
-    assert Path("new/folder/episode.mp4").read_bytes()[4:8] == b"ftyp"
+    command(f"run={run}", "out=new/folder/episode.MP4", "episodes=1")
+    assert Path("new/folder/episode.MP4").read_bytes()[4:8] == b"ftyp"
 
 
 def test_terminal(run, command):

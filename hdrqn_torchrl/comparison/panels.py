@@ -229,4 +229,4 @@ def save(figure: Figure, paths: Iterable[Path]) -> None:
     with matplotlib.rc_context(_STYLE):
         for path in paths:
             undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-            figure.savefig(path, metadata=undated.get(path.suffix))
+            figure.savefig(path, metadata=undated.get(path.suffix.lower()))

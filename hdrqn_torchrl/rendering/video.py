@@ -35,9 +35,9 @@ def check_video(path: Path | None, *, fps: int) -> None:
     Raises:
         ValueError: if the file has another ending than .gif or .mp4, PyAV is missing, or ``fps`` is out of range.
     """
-    if path is not None and path.suffix not in _WRITERS:
+    if path is not None and path.suffix.lower() not in _WRITERS:
         raise ValueError(f"out must end in {' or '.join(_WRITERS)}, or be terminal, got {str(path)!r}.")
-    if path is not None and path.suffix == ".mp4" and find_spec("av") is None:
+    if path is not None and path.suffix.lower() == ".mp4" and find_spec("av") is None:
         raise ValueError("out=*.mp4 needs PyAV: pip install 'hdrqn_torchrl[video]', or write a .gif.")
     if not 1 <= fps <= 50:
         raise ValueError(f"fps must lie in [1, 50], got {fps}; 4 steps a second can be followed.")
@@ -57,7 +57,7 @@ def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4) -> None:
     check_video(path, fps=fps)
     if not frames:
         raise ValueError("frames must hold at least one frame, got none; record_episodes makes them.")
-    _WRITERS[path.suffix](frames, path, fps)
+    _WRITERS[path.suffix.lower()](frames, path, fps)
 
 
 def _write_gif(frames: Sequence[Frame], path: Path, fps: int) -> None:

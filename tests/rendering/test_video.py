@@ -80,6 +80,7 @@ def test_without_pyav_the_remedy_is_named(monkeypatch, tmp_path):
     with pytest.raises(ValueError, match=r"pip install 'hdrqn_torchrl\[video\]'"):
         check_video(tmp_path / "x.mp4", fps=4)
     check_video(tmp_path / "x.gif", fps=4)
+    check_video(tmp_path / "x.GIF", fps=4)
 
 
 @pytest.mark.parametrize(
