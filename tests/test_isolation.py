@@ -5,7 +5,7 @@ import random
 import numpy
 import pytest
 import torch
-from helpers import build, small_env
+from helpers import build, make_training, small_env
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.envs import ExplorationType
@@ -100,3 +100,14 @@ def test_without_a_seed_the_numbers_go_on_inside():
     with own_random_numbers():
         inside = draw()
     assert draw() == inside
+
+
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_a_training_is_the_same_however_often_it_is_evaluated(name, tmp_path):
+    weights = []
+    for frames in (32, 10**9):
+        trainer = make_training(tmp_path / str(frames), name, total_frames=160, evaluation_frames=frames)
+        trainer.train()
+        weights.append(trainer.algorithm.policy.state_dict())
+        assert trainer.updates > 5
+    assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0])

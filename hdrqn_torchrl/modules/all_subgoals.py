@@ -22,6 +22,7 @@ from hdrqn_torchrl.modules.exploration import (
     EpsilonGreedy,
     RepeatingEpsilonGreedy,
     check_chooses_subgoals,
+    check_two_schedules,
     choose_action,
     exploration_or_greedy,
 )
@@ -173,7 +174,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         repeated_action_key: random stretch in progress ``[2]``, for a :class:`RepeatingEpsilonGreedy`.
 
     Raises:
-        ValueError: if an exploration is none, or ``meta_exploration`` repeats its choices.
+        ValueError: if an exploration is none, both are one, or ``meta_exploration`` repeats its choices.
 
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -211,6 +212,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         self.network = network
         self.sub_exploration = exploration_or_greedy(sub_exploration, "sub_exploration")
         self.meta_exploration = exploration_or_greedy(meta_exploration, "meta_exploration")
+        check_two_schedules(self.sub_exploration, self.meta_exploration)
         check_chooses_subgoals(self.meta_exploration, "meta_exploration")
         self.sub_exploration.set_num_subgoals(network.num_subgoals)
         self.observation_key, self.previous_action_key, self.init_key = observation_key, previous_action_key, init_key

@@ -24,6 +24,7 @@ from hdrqn_torchrl.modules.exploration import (
     EpsilonGreedy,
     RepeatingEpsilonGreedy,
     check_chooses_subgoals,
+    check_two_schedules,
     choose_action,
     exploration_or_greedy,
 )
@@ -253,7 +254,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
         init_key: first step of an episode ``[1]`` bool; read if ``read_last_observation``.
 
     Raises:
-        ValueError: if the two do not fit each other, or there is no state to advance.
+        ValueError: if the two do not fit each other, share an exploration, or there is no state to advance.
     """
 
     def __init__(
@@ -271,6 +272,7 @@ class HierarchicalPolicy(TensorDictModuleBase):
                 f"sub_controller must have as many conditions as the meta_controller has subgoals, got {known} and "
                 f"{chosen}; build its network with num_conditions={chosen}."
             )
+        check_two_schedules(sub_controller.exploration, meta_controller.exploration)
         if read_last_observation and not sub_controller.network.recurrent:
             raise ValueError("read_last_observation must be False without recurrence: the sub_controller has no state.")
         self.meta_controller, self.sub_controller = meta_controller, sub_controller

@@ -229,6 +229,19 @@ def exploration_or_greedy(exploration: EpsilonGreedy | None, name: str) -> Epsil
     return exploration
 
 
+def check_two_schedules(sub: EpsilonGreedy, meta: EpsilonGreedy) -> None:
+    """Refuses one exploration for two levels.
+
+    Raises:
+        ValueError: if they are the same.
+    """
+    if sub is meta:
+        raise ValueError(
+            f"meta_exploration must not be the sub level's, got one {type(meta).__name__} for both: its schedule would "
+            "run twice as fast; give each level its own."
+        )
+
+
 def check_chooses_subgoals(exploration: EpsilonGreedy, name: str) -> None:
     """Refuses what is made for actions where subgoals are chosen.
 

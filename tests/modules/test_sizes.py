@@ -131,6 +131,17 @@ class TestControllers:
         with pytest.raises(ValueError, match="as many conditions as the meta_controller has subgoals, got 2 and 3; "):
             HierarchicalPolicy(MetaController(self.network(3)), SubController(self.network(2, 2)))
 
+    def test_each_level_has_a_schedule_of_its_own(self):
+        shared = EpsilonGreedy()
+        for make in (
+            lambda: AllSubgoalsPolicy(AllSubgoalsNetwork(FEATURES, num_actions=2, num_subgoals=2), shared, shared),
+            lambda: HierarchicalPolicy(
+                MetaController(self.network(), shared), SubController(self.network(2, 2), shared)
+            ),
+        ):
+            with pytest.raises(ValueError, match="meta_exploration must not be the sub level's, got one EpsilonGreedy"):
+                make()
+
     def test_without_a_state_there_is_none_to_advance(self):
         sub = SubController(self.network(2, 2, recurrent=False))
         with pytest.raises(ValueError, match="read_last_observation must be False without recurrence"):
