@@ -9,7 +9,8 @@ import hdrqn_torchrl
 
 ORDER = (
     "keys", "devices", "run_files", "stored_settings", "transforms", "envs", "modules", "objectives", "data",
-    "collectors", "precision", "finite", "learner", "legs", "phases", "algorithms", "isolation", "intervals",
+    "collectors", "precision", "finite", "learner_settings", "learner",
+    "legs", "phases", "algorithms", "isolation", "intervals",
     "evaluation", "serialization", "checkpoint", "interruption", "locking", "services", "logging", "results",
     "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "transfer", "trainer",
     "run_folder",

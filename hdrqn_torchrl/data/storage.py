@@ -45,7 +45,7 @@ class SequenceStorage(LazyTensorStorage):
             )
 
     def state_dict(self) -> dict[str, Any]:
-        if self._storage is None:
+        if self._storage is None or not len(self):  # or emptied
             return {"stored": None}
         stored = self[:]  # the part that was written
         return {"stored": stored, "rows": len(self._storage), "last_cursor": self._last_cursor_index}

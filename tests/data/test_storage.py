@@ -78,6 +78,24 @@ def test_a_copy_of_a_memory_of_options_goes_on_as_the_original(capacity):
     assert len(first) == capacity
 
 
+@every_sampling
+def test_one_that_was_emptied_is_as_good_as_new(sampling, priority_exponent):
+    used, new = make(32, sampling, priority_exponent), make(32, sampling, priority_exponent)
+    for batch in stream_of_batches(4, 5):
+        used.extend(batch.clone())
+        drawn(used, 0)
+    used.empty()
+    copy = make(32, sampling, priority_exponent)
+    copy.load_state_dict(deepcopy(used.state_dict()))
+    for number, batch in enumerate(stream_of_batches(4, 5)):
+        expected = []
+        for buffer in (new, used, copy):
+            buffer.extend(batch.clone())
+            expected.append(drawn(buffer, number))
+        assert [each is None for each in expected] == [expected[0] is None] * 3
+        assert expected[0] is None or all((each == expected[0]).all() for each in expected)
+
+
 class TestBatches:
     def test_a_single_step_is_one(self):
         one_by_one, at_once = make(60), make(60)
