@@ -21,6 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 import sweeps
 from building import build, build_algorithm, build_env, explain, plain
 from configuration import RunError, SettingsError, check, pick_device, resolved
+from hdrqn_torchrl.run_files import check_file, remove, write_whole
 from resuming import Plan, holds_run, plan, record
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ def noting_errors(run: Plan, *, unless: tuple[type[Exception], ...] = ()) -> Ite
 def note_error(folder: Path) -> None:
     """Writes the traceback of the error at hand to ``error.txt``."""
     with contextlib.suppress(OSError):
-        (folder / "error.txt").write_text(traceback.format_exc())
+        write_whole(folder / "error.txt", traceback.format_exc())
 
 
 def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
@@ -126,12 +127,14 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     from hdrqn_torchrl.checkpoint import Checkpoints
     from hdrqn_torchrl.transfer import find_weights, load_weights_of, start_from
 
+    for name in ("config.yaml", "run.json", "metrics.csv", "error.txt", "summary.json", "curves.png"):
+        check_file(run.folder / name)
     checkpoints = Checkpoints(run.folder / "checkpoints")
     checkpoints.clean_up()  # first: it may bring back the newest
     start = run.checkpoint or (checkpoints.newest() if run.resumed else None)
-    stale = [*run.folder.glob("*.partial"), *([run.folder / "metrics.csv"] if start is None else [])]
+    stale = [*run.folder.glob("*.partial*"), *([run.folder / "metrics.csv"] if start is None else [])]
     for path in stale:
-        path.unlink(missing_ok=True)
+        remove(path)
     trainer, evaluation_env, references = build_run(run)
     if start is not None:
         trainer.resume(start)
@@ -142,7 +145,7 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
         run = replace(run, weights=path)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
     for name in ("error.txt", "summary.json", "curves.png"):
-        (run.folder / name).unlink(missing_ok=True)
+        remove(run.folder / name)
     return trainer, evaluation_env, references
 
 

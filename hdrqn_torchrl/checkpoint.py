@@ -1,14 +1,15 @@
 """Checkpoints of a whole training, on ``torchrl.checkpoint``: durable, verified, and unable to run code.
 
-TorchRL's ``Checkpoint`` writes a folder beside its destination and renames it, and its ``CheckpointRotation`` keeps
-the last and the best. Added here: files that need no pickle (``serialization.py``); every byte on the disk (fsync)
-before a checkpoint gets its name; a checksum of every file, checked before anything is loaded; removal of what killed
-writes left behind.
+TorchRL's ``Checkpoint`` writes a folder beside its destination and renames it. (Its ``CheckpointRotation`` is not used:
+it reads whatever lies beside, archives and pipes, too.) Added here: files that need no pickle (``serialization.py``);
+every byte on the disk (fsync) before a checkpoint gets its name; a checksum of every file, checked before anything is
+loaded; the last few and the best are kept; removal of what killed writes left behind.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import sys
@@ -22,9 +23,11 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
-from torchrl.checkpoint import Checkpoint, CheckpointError, CheckpointRotation
+from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 
-from hdrqn_torchrl.serialization import SafetensorsAdapter
+from hdrqn_torchrl.run_files import RunFileError, check_file, check_folder, is_hollow, memory_of_this_machine, read_json
+from hdrqn_torchrl.serialization import SafetensorsAdapter, check_tensors
+from hdrqn_torchrl.state_checks import Rule
 
 CHECKSUMS = "checksums.json"
 PREFIX, SCORE, MEMORY = "checkpoint-", "greedy_return", "memory-"
@@ -37,13 +40,15 @@ class DurableCheckpoint(Checkpoint):
     """TorchRL's ``Checkpoint`` with checksums, written to the disk before it gets its name.
 
     Args:
-        **components: objects with ``state_dict`` and ``load_state_dict``.
+        components: objects with ``state_dict`` and ``load_state_dict``, by name.
+        rules: see :class:`~hdrqn_torchrl.serialization.SafetensorsAdapter`.
     """
 
-    def __init__(self, **components: Any) -> None:
+    def __init__(self, components: Mapping[str, Any], rules: Mapping[str, Rule] | None = None) -> None:
         super().__init__()
         for name, component in components.items():
-            self.register(name, component, adapter=SafetensorsAdapter())
+            holds_steps = name.startswith(("collector", "learner-", MEMORY))  # others have sums under the same names
+            self.register(name, component, adapter=SafetensorsAdapter(rules if holds_steps else None))
 
     @staticmethod
     def _publish_path(source: Path, destination: Path) -> None:
@@ -51,6 +56,23 @@ class DurableCheckpoint(Checkpoint):
         _seal(source, {path.relative_to(source).as_posix(): _checksum(path) for path in files})
         Checkpoint._publish_path(source, destination)
         _sync(destination.parent)
+
+
+class RandomState(GlobalRNGState):
+    """TorchRL's state of all global random generators, whose position in numpy's table is checked."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Restores what ``state_dict`` returned.
+
+        Raises:
+            ValueError: if it can't be what it returned: numpy reads beyond its table then.
+        """
+        name, table, place, *_ = state_dict["numpy"]
+        if name != "MT19937" or table.shape != (624,) or not 0 <= place <= 624:
+            raise ValueError(
+                "the stored state of numpy's random numbers must be one of MT19937; use another checkpoint."
+            )
+        super().load_state_dict(state_dict)
 
 
 class Checkpoints:
@@ -81,7 +103,7 @@ class Checkpoints:
         if replay not in (True, False, "last"):
             raise ValueError(f"replay must be True, False or 'last', got {replay!r}; True resumes bit for bit.")
         self.directory, self.replay = directory, replay
-        self._rotation = CheckpointRotation(directory, keep_last=keep_last, keep_best=(SCORE, "max"))
+        self._keep_last = keep_last
 
     def save(self, components: Mapping[str, Any], *, step: int, score: float | None = None) -> Path:
         """Writes a checkpoint and removes those that are no longer kept.
@@ -97,12 +119,15 @@ class Checkpoints:
         try:
             metadata = {SCORE: _UNSCORED if score is None else score}
             kept = {name: each for name, each in components.items() if self.replay or not name.startswith(MEMORY)}
-            path = self._rotation.save(DurableCheckpoint(**kept), step=step, metadata=metadata)
+            self._check_place()
+            path = self.directory / f"{PREFIX}{step:012d}"
+            DurableCheckpoint(kept).save(path, metadata=metadata)
+            self._prune()
             for earlier in self._paths():
                 if self.replay == "last" and earlier != path:
                     _forget_memories(earlier)
             return path
-        except (OSError, SafetensorError) as error:
+        except (OSError, SafetensorError, RunFileError) as error:
             raise CheckpointError(
                 f"the checkpoint at step {step} can't be written to {self.directory} ({error}); {self.last_good()}. "
                 "Make room or make the folder writable, then resume the run."
@@ -113,10 +138,39 @@ class Checkpoints:
         whole = next(self._whole(), None)
         return f"the last good checkpoint is {whole}" if whole else "there is no earlier checkpoint"
 
-    def load(self, components: Mapping[str, Any], path: Path, device: torch.device | str = "cpu") -> list[str]:
+    def _check_place(self) -> None:
+        """Refuses a link in place of the folder: what lies elsewhere is neither read nor removed."""
+        try:
+            check_folder(self.directory, root=self.directory.parent)
+        except RunFileError as error:
+            raise CheckpointError(str(error)) from error
+
+    def _prune(self) -> None:
+        """Removes all but the newest and the best; what can't be read as a checkpoint is left alone."""
+        scores = {path: score for path in self._paths() if (score := _score(path)) is not None}  # the newest first
+        kept = {
+            *list(scores)[: self._keep_last],
+            max(scores, key=lambda path: (scores[path], _step(path)), default=None),
+        }
+        for path in scores.keys() - kept:
+            _remove(path.rename(path.with_name(f".{path.name}.delete")))
+
+    def load(
+        self,
+        components: Mapping[str, Any],
+        path: Path,
+        device: torch.device | str = "cpu",
+        rules: Mapping[str, Rule] | None = None,
+    ) -> list[str]:
         """Restores components from the checkpoint ``path`` after checking all of it.
 
         Those named ``memory-...`` are left alone if it was saved without them.
+
+        Args:
+            components: objects with ``load_state_dict``, by name.
+            path: the checkpoint.
+            device: where tensors are put.
+            rules: what entries of TensorDicts must be (:func:`~hdrqn_torchrl.state_checks.rules_of`).
 
         Returns:
             Names of the components that were left alone.
@@ -128,7 +182,7 @@ class Checkpoints:
         try:
             stored = Checkpoint.manifest(path)["components"]
             wanted = {name: each for name, each in components.items() if name in stored or not name.startswith(MEMORY)}
-            DurableCheckpoint(**wanted).load(path, map_location=device)
+            DurableCheckpoint(wanted, rules).load(path, map_location=device)
             return [name for name in components if name not in wanted]
         except CheckpointError as error:
             raise CheckpointError(
@@ -152,7 +206,7 @@ class Checkpoints:
 
     def best(self) -> Path | None:
         """The whole checkpoint with the best score, or the newest if none has one."""
-        return max(self._whole(), key=_score, default=None) or self.newest()
+        return max(self._whole(), key=lambda path: _score(path) or _UNSCORED, default=None) or self.newest()
 
     def go_back_to(self, step: int) -> None:
         """Removes later checkpoints, as their steps will be done again, and damaged ones, which would count as kept."""
@@ -163,8 +217,9 @@ class Checkpoints:
 
     def _paths(self) -> list[Path]:
         """Folders named like checkpoints, the newest first."""
-        folders = self.directory.glob(f"{PREFIX}[0-9]*")
-        return sorted((path for path in folders if _step(path) >= 0 and path.is_dir()), key=_step, reverse=True)
+        self._check_place()
+        folders = (path for path in self.directory.glob(f"{PREFIX}[0-9]*") if path.is_dir() and not path.is_symlink())
+        return sorted((path for path in folders if _step(path) >= 0), key=_step, reverse=True)
 
     def _whole(self) -> Iterator[Path]:
         """Undamaged checkpoints, the newest first."""
@@ -178,6 +233,7 @@ class Checkpoints:
 
     def clean_up(self) -> None:
         """Removes what killed writes left behind. Call it when no other process writes here."""
+        self._check_place()
         for orphan in self.directory.glob(f".{PREFIX}*"):
             name, _, kind = orphan.name[1:].rpartition(".")
             if kind.startswith("backup-") and not (self.directory / name).exists():
@@ -189,7 +245,7 @@ class Checkpoints:
 def _forget_memories(path: Path) -> None:
     """Replaces a checkpoint by one without its memories; a kill leaves what :meth:`Checkpoints.clean_up` mends."""
     try:
-        manifest, sums = Checkpoint.manifest(path), json.loads((path / CHECKSUMS).read_text())
+        manifest, sums = Checkpoint.manifest(path), read_json(path / CHECKSUMS)
         memories = [name for name in manifest["components"] if name.startswith(MEMORY)]
         places = [manifest["components"].pop(name)["path"] for name in memories]
     except (CheckpointError, ValueError, TypeError, KeyError, AttributeError):
@@ -197,7 +253,7 @@ def _forget_memories(path: Path) -> None:
     if not places:
         return
     stage, backup = (path.with_name(f".{path.name}.{kind}-0") for kind in ("stage", "backup"))
-    shutil.copytree(path, stage, ignore=shutil.ignore_patterns(*(Path(place).name for place in places)))
+    shutil.copytree(path, stage, symlinks=True, ignore=shutil.ignore_patterns(*(Path(place).name for place in places)))
     (stage / "manifest.json").write_text(json.dumps(manifest))
     kept = {name: each for name, each in sums.items() if not name.startswith(tuple(f"{place}/" for place in places))}
     _seal(stage, kept | {"manifest.json": _checksum(stage / "manifest.json")})  # of the others as they were written
@@ -233,10 +289,14 @@ def _step(path: Path) -> int:
     return int(number) if number.isdecimal() else -1
 
 
-def _score(path: Path) -> float:
-    metadata = Checkpoint.manifest(path).get("metadata")
-    score = metadata.get(SCORE) if isinstance(metadata, dict) else None
-    return score if isinstance(score, float) else _UNSCORED
+def _score(path: Path) -> float | None:
+    """What a checkpoint scored, the least there is if it was not measured; ``None`` if it can't be read."""
+    try:
+        metadata = read_json(path / "manifest.json", root=path)["metadata"]
+        score = metadata.get(SCORE) if isinstance(metadata, dict) else None
+        return score if isinstance(score, float) and math.isfinite(score) else _UNSCORED
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
 
 
 def verify(path: Path) -> None:
@@ -246,26 +306,46 @@ def verify(path: Path) -> None:
         CheckpointError: if it is not, naming the file at fault.
     """
     try:
-        sums = json.loads((path / CHECKSUMS).read_text())
+        sums = read_json(path / CHECKSUMS, root=path)
         if not isinstance(sums, dict) or "manifest.json" not in sums:
             raise ValueError("it lists no files")
-    except (OSError, ValueError, RecursionError) as error:
+    except (OSError, ValueError) as error:
         raise CheckpointError(f"{path} is not a checkpoint of this package ({CHECKSUMS}: {error}).") from error
+    _check_files(path, sums)
     for name, expected in sums.items():
-        file = path / name
-        if not file.resolve().is_relative_to(path.resolve()):
-            raise CheckpointError(f"{path} is not a checkpoint of this package: {name} lies outside of it.")
-        if not file.is_file():
-            raise CheckpointError(f"{path} is not complete: {name} is missing.")
-        if _checksum(file) != expected:
+        if _checksum(path / name) != expected:
             raise CheckpointError(f"{path} is damaged: {name} is not what was written.")
     try:
+        read_json(path / "manifest.json", root=path)  # whether TorchRL may
         records = Checkpoint.manifest(path)["components"].values()
-    except (CheckpointError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (CheckpointError, OSError, ValueError, TypeError, AttributeError) as error:
         raise CheckpointError(f"{path} is not a checkpoint of this package (manifest.json: {error}).") from error
     for record in records:
         if not {f"{record['path']}/{name}" for name in record["files"]} <= set(sums):
             raise CheckpointError(f"{path} is not complete: {CHECKSUMS} lacks files of {record['path']}.")
+
+
+def _check_files(path: Path, sums: Mapping[str, Any]) -> None:
+    """What can be told without reading much, before much is read: places, kinds and sizes."""
+    total = 0
+    for name, expected in sums.items():
+        file = path / name
+        try:
+            if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(path)):
+                raise RunFileError(f"{name} lies outside of it")
+            check_file(file, root=path)
+        except RunFileError as error:
+            raise CheckpointError(f"{path} is not a checkpoint of this package: {error}.") from error
+        if not file.is_file():
+            raise CheckpointError(f"{path} is not complete: {name} is missing.")
+        size = file.stat().st_size
+        if not isinstance(expected, list) or expected[:1] != [size]:
+            raise CheckpointError(f"{path} is damaged: {name} is not what was written.")
+        total += size
+        if is_hollow(file) or total > memory_of_this_machine():
+            raise CheckpointError(
+                f"{path} is damaged: {name} holds less than its {size:,} bytes, or more than memory does."
+            )
 
 
 def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
@@ -323,8 +403,9 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
     try:
+        check_tensors(path)
         return load_file(path)
-    except SafetensorError as error:
+    except (SafetensorError, ValueError) as error:
         raise ValueError(
             f"{path} must be a safetensors file, got something else ({error}); see checkpoints/."
         ) from error

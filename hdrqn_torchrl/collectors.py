@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tensordict import NestedKey, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
 
@@ -52,13 +53,29 @@ class ResumableCollector(Collector):
         return {**state, "base_env": self._base_env.state_dict(), "carrier": self._carrier.exclude("next").clone()}
 
     def load_state_dict(self, state_dict: dict[str, Any], **kwargs) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if the step that was about to be taken is of other entries than this environment's.
+        """
         super().load_state_dict(state_dict, strict=False)
         self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL numbered the episodes anew
         self._base_env.load_state_dict(state_dict["base_env"])
+        _check_like(state_dict["carrier"], self.state_dict()["carrier"], self.env.action_keys)
         self._carrier = state_dict["carrier"].clone()
         if self._carrier_has_no_device:
             self._carrier.clear_device_()
+
+
+def _check_like(carrier: TensorDictBase, own: TensorDictBase, chosen: Sequence[NestedKey]) -> None:
+    """Compares entries, apart from what a policy has chosen, which is not there before the first step."""
+    found, expected = (
+        {key: (value.dtype, value.shape) for key, value in each.items(True, True) if key not in chosen}
+        for each in (carrier, own)
+    )
+    if found != expected:
+        names = sorted(str(key) for key in found.keys() | expected.keys() if found.get(key) != expected.get(key))
+        raise ValueError(f"the stored step must have the entries of this environment, got others: {', '.join(names)}.")
 
 
 def _is_empty(state: Mapping[str, Any]) -> bool:

@@ -280,6 +280,7 @@ class Learner:
         """
         self._check_counters(state)
         self._continuity.reset()
+        self._check_optimizer(state["optimizer"])
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.extract.load_state_dict(state["extract"])
@@ -293,6 +294,31 @@ class Learner:
             self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)
         if self.settings.precision == "auto":  # another machine might choose another one
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
+
+    def _check_optimizer(self, stored: Mapping[str, Any]) -> None:
+        """Refuses moments of other shapes, which Adam would not notice, and other options than its own."""
+        own = self.optimizer.state_dict()["param_groups"]
+        parameters = [each for group in self.optimizer.param_groups for each in group["params"]]
+        same = [
+            all(theirs[key] == mine[key] for key in mine.keys() & theirs.keys() - {"lr"})
+            for mine, theirs in zip(own, stored["param_groups"], strict=True)
+        ]
+        fits = all(
+            0 <= index < len(parameters)
+            and all(
+                moment.dtype == parameters[index].dtype and moment.shape in (torch.Size(), parameters[index].shape)
+                if name == "step"
+                else (moment.dtype, moment.shape) == (parameters[index].dtype, parameters[index].shape)
+                for name, moment in moments.items()
+            )
+            and {"step", "exp_avg", "exp_avg_sq"} <= moments.keys()
+            for index, moments in stored["state"].items()
+        )
+        if not (all(same) and fits):
+            raise ValueError(
+                "the stored optimiser must have the parameters, shapes and options of this one, got others; load it "
+                "with the settings that it was saved with."
+            )
 
     def _check_counters(self, state: Mapping[str, Any]) -> None:
         """Refuses counts that no training has: an update would be made for each one that is missing."""

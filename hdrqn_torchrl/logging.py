@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torchrl.record.loggers.common import Logger
 
+from hdrqn_torchrl.run_files import open_file, read_bytes, read_text, replaced
 from hdrqn_torchrl.services import make_mlflow_logger, make_tensorboard_logger, make_wandb_logger
 
 __all__ = ["CSVLog", "RunLogger", "make_mlflow_logger", "make_tensorboard_logger", "make_wandb_logger"]
@@ -39,53 +40,60 @@ class CSVLog:
     def __init__(self, path: Path) -> None:
         self.path, self.columns, self.rows = path, list[str](), 0
         if path.exists():
-            rows = self._read()
-            self.columns, self.rows = list(rows[0]) if rows else [], len(rows)
-            if not path.read_bytes().endswith(b"\n"):
-                self._rewrite(self.columns, rows)  # the next row would be appended to half of one
+            self.columns, rows = self._read()
+            self.rows = len(rows)
+            if not read_bytes(path).endswith(b"\n"):
+                self._rewrite(self.columns)  # the next row would be appended to half of one
 
     def write(self, row: Row) -> None:
         """Appends one row; it is on the disk when this returns."""
         if new := [name for name in row if name not in self.columns]:
             self._widen(new)
-        with self.path.open("a", newline="") as file:
+        with open_file(self.path, "a", newline="") as file:
             csv.DictWriter(file, self.columns, restval="", lineterminator="\n").writerow(measured(row))
             file.flush()
             os.fsync(file.fileno())
         self.rows += 1
 
     def _widen(self, new: list[str]) -> None:
-        self._rewrite([*self.columns, *new], self._read() if self.path.exists() else [])
+        self._rewrite([*self.columns, *new])
 
-    def _read(self) -> list[dict[str, str]]:
-        """All whole rows; a killed process may have left half of one at the end."""
-        text = self.path.read_text()
-        return list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
+    def _read(self) -> tuple[list[str], list[list[str]]]:
+        """Columns and all whole rows; a killed process may have left half of one at the end."""
+        text = read_text(self.path) if self.path.exists() else ""
+        columns, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
+        return columns, rows
 
     def last_frames(self) -> int:
         """``frames`` of the last row; -1 if there is none."""
-        rows = self._read() if self.path.exists() else []
-        return int(rows[-1]["frames"]) if rows else -1
+        columns, rows = self._read()
+        return int(dict(zip(columns, rows[-1], strict=False)).get("frames", "-1")) if rows else -1
 
-    def _rewrite(self, columns: list[str], rows: list[dict[str, str]]) -> None:
+    def _rewrite(self, columns: list[str], until: int | None = None) -> None:
+        """Writes the file anew with these columns and the first rows."""
+        before, rows = self._read()
+        rows = rows[:until]
         self.columns, self.rows = columns, len(rows)
-        partial = self.path.with_suffix(".partial")
-        with partial.open("w", newline="") as file:
+        with replaced(self.path) as partial, partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, columns, restval="", extrasaction="ignore", lineterminator="\n")
             writer.writeheader()
-            writer.writerows(rows)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(self.path)
+            writer.writerows(dict(zip(before, row, strict=False)) for row in rows)
 
     def state_dict(self) -> dict[str, Any]:
         """Its position: columns and number of rows."""
         return {"columns": list(self.columns), "rows": self.rows}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to a position: later rows are dropped from the file, as they will be written again."""
+        """Goes back to a position: later rows are dropped from the file, as they will be written again.
+
+        Raises:
+            ValueError: if it can't be one.
+        """
+        columns, rows = list(state["columns"]), state["rows"]
+        if not all(isinstance(name, str) for name in columns) or type(rows) is not int or rows < 0:
+            raise ValueError("the stored place in metrics.csv must be columns and rows, got others; use another one.")
         if self.path.exists():
-            self._rewrite(list(state["columns"]), self._read()[: state["rows"]])
+            self._rewrite(columns, rows)
 
 
 class RunLogger:

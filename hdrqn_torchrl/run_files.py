@@ -199,3 +199,28 @@ def remove(path: Path, *, root: Path | None = None) -> None:
     """
     check_file(path, root=root)
     path.unlink(missing_ok=True)
+
+
+def is_hollow(path: Path) -> bool:
+    """Whether a large file is next to nothing but holes: it claims a size that nobody has written."""
+    with open_file(path) as file:
+        descriptor, size = file.fileno(), os.fstat(file.fileno()).st_size
+        if size < 256 * MEGABYTE or not hasattr(os, "SEEK_HOLE"):
+            return False
+        place = data = 0
+        while place < size and data * 100 < size:
+            try:
+                start = os.lseek(descriptor, place, os.SEEK_DATA)
+            except OSError:  # only a hole is left
+                break
+            place = os.lseek(descriptor, start, os.SEEK_HOLE)
+            data += place - start
+    return data * 100 < size
+
+
+def memory_of_this_machine() -> int:
+    """Bytes of its main memory; a large number where that is not told."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):
+        return 1 << 50

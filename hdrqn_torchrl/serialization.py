@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.checkpoint import CheckpointAdapter
 
+from hdrqn_torchrl.run_files import open_file, read_json
+from hdrqn_torchrl.state_checks import Rule, check_entries
+
 TENSORS, STRUCTURE = "tensors.safetensors", "structure.json"
+LARGEST_HEADER = 16 << 20  # bytes; a thousand times that of a large training
 
 
 class SafetensorsAdapter(CheckpointAdapter):
@@ -21,9 +26,16 @@ class SafetensorsAdapter(CheckpointAdapter):
 
     TorchRL's own adapter falls back to ``torch.load`` when it meets a pickle; this one has nothing to fall back to.
     A state may nest dicts, lists, tuples, tensors, TensorDicts, numbers, strings and ``None``.
+
+    Args:
+        rules: what entries of TensorDicts must be, checked before they are loaded
+            (:func:`~hdrqn_torchrl.state_checks.rules_of`).
     """
 
     adapter_id = "hdrqn_torchrl.safetensors"
+
+    def __init__(self, rules: Mapping[str, Rule] | None = None) -> None:
+        self.rules = rules or {}
 
     def save(self, component: Any, path: Path, *, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> None:
         path.mkdir(parents=True, exist_ok=True)
@@ -44,8 +56,37 @@ class SafetensorsAdapter(CheckpointAdapter):
         kwargs: Mapping[str, Any],
     ) -> None:
         device = torch.device(map_location or "cpu")
-        structure = json.loads((path / STRUCTURE).read_text())
-        component.load_state_dict(_decode(structure, load_file(path / TENSORS), device))
+        root = path.parents[1]  # of the checkpoint
+        structure = read_json(path / STRUCTURE, root=root)
+        check_tensors(path / TENSORS, root=root)
+        state = _decode(structure, load_file(path / TENSORS), device)
+        check_entries(state, self.rules)
+        component.load_state_dict(state)
+
+
+def check_tensors(path: Path, *, root: Path | None = None) -> None:
+    """Refuses a safetensors file that promises more than it holds, before it is mapped.
+
+    Args:
+        path: the file.
+        root: see :func:`~hdrqn_torchrl.run_files.check_file`.
+
+    Raises:
+        ValueError: if it is none, or its header or size is not what the tensors in it need.
+    """
+    with open_file(path, root=root) as file:
+        size = os.fstat(file.fileno()).st_size
+        length = int.from_bytes(file.read(8), "little")
+        if not 2 <= length <= min(size - 8, LARGEST_HEADER):
+            raise ValueError(f"{path} must be a safetensors file, got one whose header would have {length:,} bytes.")
+        try:
+            header = json.loads(file.read(length))
+            ends = [each["data_offsets"][1] for name, each in header.items() if name != "__metadata__"]
+            needed = 8 + length + max(ends, default=0)
+        except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+            raise ValueError(f"{path} must be a safetensors file, got one with another header ({error}).") from error
+    if needed != size:
+        raise ValueError(f"{path} must have the {needed:,} bytes that its header tells of, got {size:,}.")
 
 
 def _encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:

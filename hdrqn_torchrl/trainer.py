@@ -7,6 +7,7 @@ learners draws from its own.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -17,17 +18,17 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.checkpoint import MEMORY, Checkpoints
+from hdrqn_torchrl.checkpoint import MEMORY, Checkpoints, RandomState
 from hdrqn_torchrl.evaluation import EpisodeTracker
 from hdrqn_torchrl.finite import NonFiniteError
 from hdrqn_torchrl.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.learner import Learner
 from hdrqn_torchrl.logging import Row, RunLogger
+from hdrqn_torchrl.state_checks import rules_of
 
 
 class Trainer:
@@ -210,7 +211,8 @@ class Trainer:
         """
         assert self.checkpoints is not None
         device = next(self.algorithm.policy.parameters()).device
-        missing = self.checkpoints.load(self._components(), path, device=device)
+        rules = rules_of(self.collector.env) if hasattr(self.collector, "env") else {}  # others are made elsewhere
+        missing = self.checkpoints.load(self._components(), path, device=device, rules=rules)
         self.checkpoints.go_back_to(self.frames)
         self.collector.update_policy_weights_()
         self._saved_at, self._saved_position = time.monotonic(), self._position
@@ -233,7 +235,7 @@ class Trainer:
             "logger": self.logger,
             **({} if self.algorithm.phases is None else {"phases": self.algorithm.phases}),
             "policy": self.algorithm.policy,
-            "random": GlobalRNGState(),
+            "random": RandomState(),
             "trainer": self,
         }
 
@@ -250,7 +252,12 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it can't be what a trainer returned.
+        """
+        _check_counters(state)
         self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
         self._completed = state["completed"]
         self._started = time.monotonic() - state["wall_seconds"]
@@ -271,6 +278,19 @@ def _but_memory(learner: Learner) -> _Part:
 
 def _memory(learner: Learner) -> _Part:
     return _Part(learner.memory_state_dict, learner.load_memory_state_dict)
+
+
+def _check_counters(state: dict[str, Any]) -> None:
+    window, sums = state["window"], state["tracker"]["sums"]
+    counts = [state["frames"], state["episodes"], window["frames"], state["completed"] or 0, *window["counts"].values()]
+    times = [state["wall_seconds"], window["seconds"]]
+    fine = all(type(count) is int and 0 <= count < 2**53 for count in counts)
+    fine &= all(isinstance(each, (int, float)) and 0 <= each < 2**53 for each in times)
+    fine &= isinstance(state["best_return"], float) and state["best_return"] < math.inf
+    fine &= sums is None or (isinstance(sums, TensorDictBase) and sums.ndim == 1)
+    fine &= all(isinstance(each, TensorDictBase) and each.ndim == 1 for each in window["episodes"])
+    if not fine:
+        raise ValueError("the stored trainer's counts must be those of a training, got others; use another checkpoint.")
 
 
 def crossed(before: int, after: int, interval: int) -> bool:

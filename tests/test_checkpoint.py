@@ -485,7 +485,7 @@ class TestHostileCheckpoints:
         file = path / "components" / "0000-policy" / "tensors.safetensors"
         file.rename(tmp_path / "elsewhere")
         file.symlink_to(tmp_path / "elsewhere")
-        assert "lies outside of it" in self.refused(checkpoints, path)
+        assert "got a symbolic link" in self.refused(checkpoints, path)
 
     def test_a_file_without_a_checksum(self, hostile):
         checkpoints, path = hostile

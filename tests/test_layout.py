@@ -11,7 +11,7 @@ ORDER = (
     "keys", "devices", "run_files", "stored_settings", "transforms", "envs", "modules", "objectives", "data",
     "collectors", "precision", "finite", "learner_settings", "learner",
     "legs", "phases", "algorithms", "isolation", "intervals",
-    "evaluation", "serialization", "checkpoint", "interruption", "locking", "services", "logging", "results",
+    "evaluation", "state_checks", "serialization", "checkpoint", "interruption", "locking", "services", "logging", "results",
     "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "transfer", "trainer",
     "run_folder",
 )  # fmt: skip

@@ -196,15 +196,30 @@ class MultiGoalGridEnv(EnvBase):
                 over that it has taken the tensors out of.)
 
         Raises:
-            ValueError: if it is the state of another number of worlds.
+            ValueError: if it is the state of another number of worlds, or of worlds that can't be.
         """
         if not strict and "steps" not in state_dict:
             return
         if len(state_dict["steps"]) != self.num_envs:
             raise ValueError(f"state_dict must hold {self.num_envs} worlds, got {len(state_dict['steps'])}.")
-        self.state = GridState(*(state_dict[name].to(self.device) for name in GridState._fields))
+        state = GridState(*(state_dict[name].to(self.device) for name in GridState._fields))
+        self._check_state(state, state_dict["steps"])
+        self.state = state
         self.steps = state_dict["steps"].to(self.device)
         self._generator.set_state(state_dict["generator"].cpu())
+
+    def _check_state(self, state: GridState, steps: Tensor) -> None:
+        """Refuses cells beyond the map: the tables are read there without a check."""
+        for name, cells, last in (("agent", state.agent, 0), ("objects", state.objects, 1)):
+            own, inside = getattr(self.state, name), (cells >= 0) & (cells < self.rules.nowhere + last)
+            if (cells.dtype, cells.shape) != (own.dtype, own.shape) or not inside.all():
+                raise ValueError(
+                    f"{name} must be {own.dtype} {list(own.shape)} of cells of the map, got {cells.dtype} "
+                    f"{list(cells.shape)} from {int(cells.min())} to {int(cells.max())}; use another checkpoint."
+                )
+        for name, found, own in (("in_order", state.in_order, self.state.in_order), ("steps", steps, self.steps)):
+            if (found.dtype, found.shape) != (own.dtype, own.shape) or (found < 0).any():
+                raise ValueError(f"{name} must be like {own.dtype} {list(own.shape)}; use another checkpoint.")
 
     def _outcome(self, events: StepEvents) -> TensorDictBase:
         terminated = events.all_collected
