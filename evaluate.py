@@ -28,6 +28,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,6 +143,7 @@ def tell(sentence: str) -> None:
 def observers_of(env: EnvBase) -> dict[str, Any]:
     """What counts legs (of hierarchical agents) and places (where there is a screen)."""
     from hdrqn_torchrl import keys
+    from hdrqn_torchrl.envs import MontezumaEnv
     from hdrqn_torchrl.evaluation import PlaceCounter
     from hdrqn_torchrl.legs import LegCounter
 
@@ -149,7 +151,7 @@ def observers_of(env: EnvBase) -> dict[str, Any]:
     observers: dict[str, Any] = {}
     if spec.get(keys.OPTION_INIT, None) is not None:
         observers["legs"] = LegCounter(spec[keys.ATTAINED].shape[-1])
-    if spec.get(keys.POSITION, None) is not None:
+    if spec.get(keys.POSITION, None) is not None and isinstance(base, MontezumaEnv):
         observers["places"] = PlaceCounter(*base.emulators.screens.shape[1:3])
     return observers
 
@@ -159,14 +161,24 @@ def legs_of(legs: LegCounter) -> dict[str, list]:
     return {"options": legs.options.tolist(), "reached": legs.reached.tolist()}
 
 
+def names_of_subgoals(base: EnvBase, number: int) -> Sequence[str]:
+    """As pictures have them; numbers for tasks that have none."""
+    from hdrqn_torchrl.rendering import scene_of
+
+    try:
+        return scene_of(base).subgoal_names
+    except ValueError:
+        return [f"subgoal {index}" for index in range(number)]
+
+
 def draw(observers: dict[str, Any], base: EnvBase, folder: Path) -> None:
     """Writes the pictures."""
     from hdrqn_torchrl.figures import plot_legs, plot_places
-    from hdrqn_torchrl.rendering import scene_of
 
     if "legs" in observers:
         legs = observers["legs"]
-        plot_legs(legs.options.numpy(), legs.reached.numpy(), scene_of(base).subgoal_names, folder / "legs.png")
+        names = names_of_subgoals(base, legs.num_subgoals)
+        plot_legs(legs.options.numpy(), legs.reached.numpy(), names, folder / "legs.png")
     if "places" in observers:
         plot_places(observers["places"].counts.numpy(), base.emulators.start.screen, folder / "places.png")
 

@@ -32,8 +32,8 @@ _FIGURES = {
     "steps_mean": "steps",
     "cut_off_rate": "cut_off",
 }
-LONGEST_EPISODE = 30_000
-"""Steps after which an episode of unknown length is taken to have no end; those of Atari games have 27,000."""
+LONGEST_EPISODE = 10_000
+"""Steps after which an episode of unknown length is taken to have no end; tasks of longer ones state their length."""
 
 
 class Observer(Protocol):

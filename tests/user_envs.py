@@ -28,6 +28,7 @@ class Corridor(EnvBase):
         without: entries that the environment does not write.
         odd: specs that differ, by entry; what is written is drawn from them.
         task: what it says about itself.
+        seed: of nothing: train.py gives it to every environment, as it does device.
         device: of all tensors.
     """
 
@@ -41,6 +42,7 @@ class Corridor(EnvBase):
         without: Sequence[str] = ("hazard", "success"),
         odd: dict[str, TensorSpec] | None = None,
         task: Task | None = None,
+        seed: int = 0,
         device: str = "cpu",
     ) -> None:
         batch = () if num_envs is None else (num_envs,)
@@ -68,6 +70,12 @@ class Corridor(EnvBase):
     def _composite(self, entries: dict[str, TensorSpec], without: Sequence[str]) -> Composite:
         kept = {key: self.odd.get(key, spec) for key, spec in entries.items() if key not in without}
         return Composite(kept, shape=self.batch_size)
+
+    def state_dict(self, *args, **kwargs):
+        return {"place": self._place, "steps": self._steps}
+
+    def load_state_dict(self, state_dict, strict=True):
+        self._place, self._steps = state_dict["place"], state_dict["steps"]
 
     def _set_seed(self, seed: int | None) -> None:
         """Nothing is random."""

@@ -1,0 +1,70 @@
+"""The scripts on a task of someone else's: no end, no success, no hazard, no order, no picture."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from test_train import TINY_HDRQN
+
+import evaluate
+import plot
+from configuration import command_line
+
+ROOT = Path(evaluate.__file__).parent
+TRUSTED = "allowed_targets=[user_envs.Corridor]"
+TASK = [
+    *("~env.layout", "~env.view", "~env.max_steps", "~env.obstacle", "env._target_=user_envs.Corridor", TRUSTED),
+    *("env.num_envs=4", "+env.pays=10.0", "device=cpu", "total_frames=1000", "log_frames=500", "logger=csv"),
+    *("evaluation.num_envs=4", "evaluation.episodes=4", "evaluation.final_episodes=4", "network.hidden_size=8"),
+    *("evaluation.interval_frames=500", "network.widths=[8]"),
+]
+HERE = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+
+
+def train(folder, *arguments):
+    command = [sys.executable, str(ROOT / "train.py"), *TASK, *arguments, "hydra.run.dir=run"]
+    return subprocess.run(command, cwd=folder, env=os.environ | HERE, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    ended = train(folder, *TINY_HDRQN, "+env.length=null", "evaluation.max_steps=20")
+    assert ended.returncode == 0, ended.stderr
+    return folder / "run"
+
+
+def call(script, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", [f"{script.__name__}.py", *arguments])
+    command_line(script.Settings, script.__doc__, script.main)
+
+
+def test_both_levels_learn_and_evaluations_end(run):
+    with (run / "metrics.csv").open(newline="") as file:
+        last = list(csv.DictReader(file))[-1]
+    assert int(last["sub/updates"]) > 0 and int(last["meta/updates"]) > 0
+    assert (float(last["greedy/steps"]), float(last["greedy/cut_off"])) == (20.0, 1.0)
+    assert not {"greedy/in_order", "greedy/success", "behaviour/in_order"} & set(last)
+    summary = json.loads((run / "summary.json").read_text())
+    assert not {"in_order_rate", "success_rate"} & set(summary) and summary["ceiling"] is None
+
+
+def test_it_is_evaluated_and_plotted_with_what_there_is(run, tmp_path, monkeypatch, capsys):
+    call(evaluate, monkeypatch, f"run={run}", "episodes=4", TRUSTED, f"figures={tmp_path}")
+    result = json.loads(capsys.readouterr().out)
+    assert result["cut_off_rate"] == 1.0 and "in_order_rate" not in result
+    assert len(result["legs"]["options"]) == 3 and (tmp_path / "legs.png").stat().st_size > 1000
+    for kind in ("curves", "greedy", "bars"):
+        call(plot, monkeypatch, f"runs={run}", f"out={tmp_path / kind}.png", f"kind={kind}")
+        assert (tmp_path / f"{kind}.png").stat().st_size > 1000
+
+
+def test_what_an_agent_needs_is_said_before_anything_is_trained(tmp_path):
+    ended = train(tmp_path, "algo=v3", "+env.without=[attained,success]")
+    assert ended.returncode == 1 and "Traceback" not in ended.stderr
+    assert "error: algo.env must have what make_v3 reads:" in ended.stderr
+    assert "'attained' must be [4, G] bool, it is missing" in ended.stderr
