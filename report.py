@@ -18,12 +18,13 @@ python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_
 from __future__ import annotations
 
 import json
+import lzma
 import re
 import tarfile
 import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from omegaconf import MISSING
@@ -36,10 +37,11 @@ from hdrqn_torchrl.estimates import Group, TaskResults, estimate_curves, estimat
 from hdrqn_torchrl.figures import plot_legs_over_time
 from hdrqn_torchrl.grouping import Entry, value_of
 from hdrqn_torchrl.results import final_value
-from hdrqn_torchrl.run_files import read_json
-from plot import as_list, common_references, read_entries
+from hdrqn_torchrl.run_files import RunFileError, read_json
+from plot import as_list, common_references, note, read_entries
 from studies import STUDIES, Drawing, Job, Study, flat, is_run_of, jobs_of
 
+LARGEST_ARCHIVE = 256 << 20  # bytes, unpacked; a hundred times what all studies take
 KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json", "evaluations/*.json")
 SIZES = ("small", "paper")
 QUANTITIES = ("return", "success", "in_order", "steps")
@@ -120,18 +122,54 @@ def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
         if pattern.endswith(".tar.xz"):
             unpacked = stack.enter_context(tempfile.TemporaryDirectory())
             try:
-                with tarfile.open(pattern) as archive:
-                    archive.extractall(unpacked, filter="data")
-            except (OSError, tarfile.TarError) as error:
+                unpack(Path(pattern), Path(unpacked))
+            except (OSError, EOFError, ValueError, lzma.LZMAError, tarfile.TarError) as error:
                 raise SettingsError(f"runs must name folders or readable archives, got {pattern}: {error}.") from error
             pattern = unpacked
         places.append(pattern)
     found = []
     for entry in read_entries(places):
-        origin = entry.run.folder / "run.json"
-        if entry.settings and origin.exists():
-            found.append(Found(entry, flat(entry.settings), read_json(origin)))
+        if entry.settings and (entry.run.folder / "run.json").exists():
+            try:
+                origin = read_json(entry.run.folder / "run.json")
+            except RunFileError as error:
+                note(f"warning: {entry.run.folder} is left out: {error}")
+                continue
+            found.append(Found(entry, flat(entry.settings), origin if isinstance(origin, dict) else {}))
     return found
+
+
+class _Bounded:
+    """A compressed file that ends with an error when more comes out of it than any report keeps."""
+
+    def __init__(self, path: Path) -> None:
+        self._file, self._left = lzma.open(path), LARGEST_ARCHIVE  # noqa: SIM115  (it goes with this object)
+
+    def read(self, size: int) -> bytes:
+        """The next bytes."""
+        content = self._file.read(min(size, self._left + 1))
+        self._left -= len(content)
+        if self._left < 0:
+            raise ValueError(f"it holds more than {LARGEST_ARCHIVE:,} bytes")
+        return content
+
+
+def unpack(archive: Path, folder: Path) -> None:
+    """Takes the files that :func:`keep` puts into an archive out of it, and refuses one that holds anything else."""
+    with tarfile.open(fileobj=_Bounded(archive), mode="r|") as members:  # type: ignore[call-overload]
+        for member in members:
+            place = PurePosixPath(member.name)
+            if member.isdir() and not place.is_absolute() and ".." not in place.parts:
+                continue
+            kept = any(
+                place.match(f"*/{pattern}") and len(place.parts) == len(Path(pattern).parts) + 1 for pattern in KEPT
+            )
+            if not member.isreg() or not kept or place.is_absolute() or ".." in place.parts:
+                raise ValueError(f"{member.name} must be a file of a run, such as 000/metrics.csv")
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            content = members.extractfile(member)
+            assert content is not None
+            (folder / place).write_bytes(content.read())
 
 
 def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[Runs, int]:

@@ -218,8 +218,12 @@ class Checkpoints:
     def _paths(self) -> list[Path]:
         """Folders named like checkpoints, the newest first."""
         self._check_place()
-        folders = (path for path in self.directory.glob(f"{PREFIX}[0-9]*") if path.is_dir() and not path.is_symlink())
-        return sorted((path for path in folders if _step(path) >= 0), key=_step, reverse=True)
+        folders = [path for path in self.directory.glob(f"{PREFIX}[0-9]*") if path.is_dir() and _step(path) >= 0]
+        if links := [path for path in folders if path.is_symlink()]:
+            raise CheckpointError(
+                f"{links[0]} must be a checkpoint, got a symbolic link; nothing in a run folder is followed."
+            )
+        return sorted(folders, key=_step, reverse=True)
 
     def _whole(self) -> Iterator[Path]:
         """Undamaged checkpoints, the newest first."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
 from hdrqn_torchrl.locking import lock
+from hdrqn_torchrl.run_files import check_folder, read_json, write_whole
 
 
 class RewindingTensorboardLogger(TensorboardLogger):
@@ -33,6 +35,7 @@ class RewindingTensorboardLogger(TensorboardLogger):
 
 def make_tensorboard_logger(folder: Path) -> Logger:
     """TorchRL's TensorBoard logger, writing to ``folder/tensorboard``."""
+    check_folder(folder / "tensorboard", root=folder)
     return RewindingTensorboardLogger("tensorboard", log_dir=str(folder))
 
 
@@ -54,6 +57,7 @@ def make_wandb_logger(
         ImportError: if wandb is not installed.
     """
     _require("wandb")
+    check_folder(folder / "wandb", root=folder)
     from torchrl.record.loggers.wandb import WandbLogger
 
     run_id = _recorded(folder / "wandb.json") or secrets.token_hex(4)
@@ -149,11 +153,17 @@ def _name(folder: Path) -> str:
 
 def _recorded(path: Path) -> str | None:
     """Id of the run at the service, if this is a resumed run."""
-    return json.loads(path.read_text())["id"] if path.exists() else None
+    if not path.exists():
+        return None
+    found = read_json(path)
+    run_id = found.get("id") if isinstance(found, dict) else None
+    if not isinstance(run_id, str) or not re.fullmatch(r"[\w-]{1,64}", run_id):
+        raise ValueError(f"{path} must name the run that is gone on with; remove it to log the rest as a new one.")
+    return run_id
 
 
 def _record(path: Path, run_id: str) -> None:
-    path.write_text(json.dumps({"id": run_id}) + "\n")
+    write_whole(path, json.dumps({"id": run_id}) + "\n")
 
 
 def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -9,11 +9,10 @@ import hdrqn_torchrl
 
 ORDER = (
     "keys", "devices", "run_files", "stored_settings", "transforms", "envs", "modules", "objectives", "data",
-    "collectors", "precision", "finite", "learner_settings", "learner",
-    "legs", "phases", "algorithms", "isolation", "intervals",
-    "evaluation", "state_checks", "serialization", "checkpoint", "interruption", "locking", "services", "logging",
-    "results", "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison", "transfer",
-    "trainer", "run_folder",
+    "collectors", "precision", "finite", "learner_settings", "learner", "legs", "phases", "algorithms", "isolation",
+    "intervals", "evaluation", "state_checks", "serialization", "checkpoint", "interruption", "locking", "services",
+    "logging", "results", "estimates", "claims", "grouping", "plotting", "figures", "rendering", "comparison",
+    "transfer", "trainer", "run_folder",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

@@ -16,6 +16,7 @@ from hdrqn_torchrl.comparison.panels import (
     GREY,
     Panel,
     add_legend,
+    as_text,
     beside_the_values,
     caption_of,
     distances,
@@ -70,7 +71,9 @@ def plot_bars(
                     if panel.column in group.estimates:
                         _draw_interval(place, position, group.estimates[panel.column], lying)
             finish_panel(place, panel, lying)
-            _name_bars(place, [group.label for group in task.groups], lying, shown=not lying or place is row[0])
+            _name_bars(
+                place, [as_text(group.label) for group in task.groups], lying, shown=not lying or place is row[0]
+            )
     unfinished = any(not run.summary for task in tasks for group in task.groups for run in group.runs)
     named = {} if lying else colors
     handles = [Patch(color=color, alpha=0.75, label=with_seeds(label, tasks)) for label, color in named.items()]

@@ -99,9 +99,12 @@ def grid_of_panels(
         )
         rows = figure.subplots(len(tasks), len(panels), squeeze=False).tolist()
         for task, row in zip(tasks, rows, strict=True):
-            row[0].set_title(task.title, loc="left", fontweight="bold")
+            row[0].set_title(as_text(task.title), loc="left", fontweight="bold")
         figure.suptitle(title)
     return figure, rows
+
+
+_LONGEST_LABEL = 120
 
 
 def styles_of(tasks: Sequence[TaskResults]) -> dict[str, tuple[str, str]]:
@@ -198,8 +201,20 @@ def caption_of(tasks: Sequence[TaskResults], center: Center) -> str:
     return "; ".join(parts)
 
 
+def as_text(label: str) -> str:
+    """A label from a run's settings as it stands: no mathematics, and not longer than a line.
+
+    Examples:
+        >>> as_text("a$b")
+        'a\\\\$b'
+    """
+    return (label if len(label) <= _LONGEST_LABEL else f"{label[: _LONGEST_LABEL - 3]}...").replace("$", r"\$")
+
+
 def add_legend(figure: Figure, handles: list[Any], explained: list[Any], caption: str) -> None:
     """Below all panels, in as many columns as fit: first the groups, then, in columns of their own, what lines mean."""
+    for handle in handles:
+        handle.set_label(as_text(handle.get_label()))
     rows = 1
     while rows < max(len(handles), len(explained)) and _width(handles, rows) + _width(explained, rows) > (
         figure.get_figwidth()

@@ -41,6 +41,9 @@ ACTIONS = ("up", "down", "left", "right")
 _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
+LARGEST_TABLE = 1 << 24  # 0.1 GB each; a map of 40x40 cells that is seen whole
+
+
 class GridState(NamedTuple):
     """Where everything stands in N worlds. ``agent`` ``[N]``, ``objects`` ``[N, num_obstacles + K]`` int64;
     ``in_order`` ``[N]`` bool: no goal was taken out of order so far."""
@@ -91,6 +94,7 @@ class GridRules:
     ) -> None:
         rows = _map_rows(layout)
         self.height, self.width = len(rows), len(rows[0])
+        self._check_size(self.height * self.width)
         if num_goals < 1:
             raise ValueError(f"num_goals must be >= 1, got {num_goals}; use 2 or 3 for the paper's tasks.")
         if num_obstacles < 0:
@@ -113,6 +117,7 @@ class GridRules:
             )
         self.num_goals, self.num_obstacles, self.teleport = num_goals, num_obstacles, obstacle == "teleport"
         self.view = view or 2 * self._span(free) + 3  # from any free cell all others and the walls around them
+        self._check_size(self.view**2)
         self.num_codes = FIRST_GOAL + num_goals
         self.nowhere = self.height * self.width
         self.is_wall = is_wall.to(device)
@@ -124,6 +129,15 @@ class GridRules:
         codes = [OBSTACLE] * num_obstacles + [FIRST_GOAL + index for index in range(num_goals)]
         self._object_codes = torch.tensor(codes, dtype=torch.uint8, device=device)
         self._goal_bits = (2 ** torch.arange(num_goals)).to(device)
+
+    def _check_size(self, places: int) -> None:
+        """Refuses maps and views whose tables would fill the memory."""
+        entries = self.height * self.width * places
+        if entries > LARGEST_TABLE:
+            raise ValueError(
+                f"layout and view must need tables of at most {LARGEST_TABLE:,} entries (cells of the map times cells "
+                f"of the map or the view), got {entries:,}; use a smaller map or view."
+            )
 
     def _span(self, free: Tensor) -> int:
         """Largest distance between two free cells along one axis."""
