@@ -6,6 +6,7 @@ import contextlib
 import json
 import subprocess
 import sys
+from collections.abc import Set
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -62,8 +63,10 @@ def plan(config: DictConfig, folder: Path) -> Plan:
             return Plan(folder, config, choices, resumed=False)
     else:
         run, checkpoint = split(Path(config.resume))
+        known = {f"sqlite:///{root}/mlflow.db" for root in (config.output_root, run.parent.parent)}
         config = with_overrides(read_config(run), read_choices(run), config, HydraConfig.get().overrides.task)
         check(config)
+        refuse_other_databases(config, known)
     refuse_differences(run, config)
     if checkpoint is not None and not config.resume_override:
         refuse_going_back(checkpoint)
@@ -146,6 +149,22 @@ def refuse_differences(run: Path, config: DictConfig) -> None:
             f"settings must be those of the run that is resumed, and differ from {run}:\n  {lines}\n"
             "Leave them out, or take the new ones with resume_override=true."
         )
+
+
+def refuse_other_databases(config: DictConfig, known: Set[str]) -> None:
+    """Ends the program if a run folder names a database or server that the command does not: it would be written to.
+
+    Args:
+        config: settings of a run that was read back.
+        known: those that need no word.
+    """
+    for index, logger in enumerate(config.logger.loggers):
+        place = logger.get("tracking_uri")
+        if place is not None and place not in {*known, *config.allowed_targets}:
+            raise SettingsError(
+                f"logger.loggers[{index}].tracking_uri must be one of {', '.join(sorted(known))}, got {place!r}, which "
+                f"stands in the run folder. If it is yours, add 'allowed_targets=[{place}]' to the command."
+            )
 
 
 def refuse_going_back(checkpoint: Path) -> None:

@@ -297,14 +297,6 @@ ATTACKS = {
     "a huge memory": (settings(algo__sub__capacity=10**12), ("evaluate", "resume")),
     "a huge map": (settings(env__layout=["#" * 900] + ["#" + " " * 898 + "#"] * 900), ("evaluate", "resume")),
     "worlds that are text": (settings(env__num_goals="two"), ("evaluate",)),
-    "a database elsewhere": (
-        settings(
-            logger__loggers=[
-                {"_target_": "hdrqn_torchrl.logging.make_mlflow_logger", "tracking_uri": "sqlite:////tmp/elsewhere.db"}
-            ]
-        ),
-        ("plan",),
-    ),
     # states
     "moments of other shapes": (
         tensors("learner-sub", resize("optimizer/state/0/exp_avg", [1])), ("resume",)
@@ -330,7 +322,7 @@ ATTACKS = {
 
 @pytest.mark.parametrize(
     ("name", "reader"),
-    [(name, reader) for name, (_, readers) in ATTACKS.items() for reader in readers if reader != "plan"],
+    [(name, reader) for name, (_, readers) in ATTACKS.items() for reader in readers],
 )
 @pytest.mark.filterwarnings("ignore:.*passed over")
 def test_it_ends_at_once_in_a_sentence(run, capsys, name, reader):

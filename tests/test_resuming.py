@@ -222,6 +222,26 @@ class TestResumingTheSameCommand:
         assert find_same(config, Path("not there")) is None
 
 
+class TestDatabases:
+    """A run folder may not send what a training measures anywhere."""
+
+    def named(self, place):
+        run = make_run("outputs/a/1", "logger=mlflow")
+        file = run / "config.yaml"
+        file.write_text(file.read_text().replace("sqlite:///outputs/mlflow.db", place))
+        return run
+
+    @pytest.mark.parametrize("place", ["http://elsewhere:5000", "sqlite:////home/mine.db", "sqlite:///../mlflow.db"])
+    def test_one_that_the_command_does_not_know_is_refused(self, place):
+        run = self.named(place)
+        with pytest.raises(SettingsError, match=re.escape(f"got {place!r}, which stands in the run folder")):
+            plan_for(f"resume={run}")
+        assert plan_for(f"resume={run}", f"allowed_targets=['{place}']").resumed
+
+    def test_the_usual_one_is_not(self):
+        assert plan_for(f"resume={self.named('sqlite:///outputs/mlflow.db')}").resumed
+
+
 class TestHostileRunFolders:
     @pytest.mark.parametrize("kind", HOSTILE)
     def test_nothing_is_executed_and_a_message_says_why(self, tmp_path, monkeypatch, kind):
