@@ -137,7 +137,13 @@ class Learner:
         self.frames += batch.numel()
         self._drawn = []
         self._set_learning_rate()
-        transitions = self.extract(batch)
+        try:
+            transitions = self.extract(batch)
+        except KeyError as error:
+            raise ValueError(
+                f"batch must hold all that environment and policy wrote, got one without an entry ({error.args[0]}); "
+                "collect without compact_obs=True, and leave nothing out."
+            ) from error
         if transitions is not None:
             self.buffer.extend(transitions)
             self._warn_of_longer_episodes(transitions)

@@ -150,6 +150,8 @@ class TestEpisodesThatAreLongerThanASequence:
     def warnings_of(self, *, batch_len=4, **settings):
         learner, steps = make_learner(**settings), make_batch(time=24)
         steps["is_init"] = (torch.arange(24) % 8 == 0).expand(2, 24).unsqueeze(-1).clone()
+        steps["next", "done"] = (torch.arange(24) % 8 == 7).expand(2, 24).unsqueeze(-1).clone()
+        steps["collector", "traj_ids"] //= 2
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             for start in range(0, 24, batch_len):

@@ -12,6 +12,7 @@ from torchrl.envs import DTypeCastTransform, GymWrapper, ParallelEnv, RenameTran
 from user_envs import Corridor, Walk
 
 from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.envs import make_montezuma
 from hdrqn_torchrl.modules import Architecture, FullyConnectedFeatures, compact_network
 
 EVERY = [*ALGORITHMS, "v3"]
@@ -79,6 +80,7 @@ class TestObservations:
             Bounded(0, 255, shape=(N, 44, 44, 3), dtype=torch.uint8),
             Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.int32),
             Unbounded(shape=(N, 3, 44, 44), dtype=torch.float64),
+            Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.float32),
             Bounded(0, 255, shape=(N, 3, 20, 20), dtype=torch.uint8),
             Categorical(5, shape=(N,), dtype=torch.int64),
             Categorical(5, shape=(N, 3, 4), dtype=torch.uint8),
@@ -91,6 +93,7 @@ class TestObservations:
             "HWC",
             "int32",
             "float64",
+            "0 to 255",
             "tiny",
             "number",
             "3x4 cells",
@@ -254,3 +257,11 @@ def test_transforms_can_be_sent_to_another_process_and_hold_no_environment(name)
 def test_the_builders_of_v3_name_themselves():
     with pytest.raises(ValueError, match=r"^env must have what make_v3 reads:\n"):
         make_v3(Corridor(None), compact_network(8))
+
+
+def test_those_of_v3_on_an_emulator_can_be_sent_as_well():
+    pytest.importorskip("ale_py")
+    env = make_montezuma(1, seed=0)
+    make_transforms = pickle.loads(pickle.dumps(build("v3", env).make_transforms))
+    seen = TransformedEnv(make_montezuma(1, seed=0), make_transforms())
+    assert seen.reset()["subgoal_mask"].shape == (1, 6)

@@ -69,23 +69,29 @@ class Continuity:
         episodes, ends = torch.cat([before, episode], 1), torch.cat([over_before, over], 1)
         jumps = (episodes[:, 1:] != episodes[:, :-1]) & ~ends[:, :-1]
         starts = batch.get(self.init_key, None)
-        if starts is not None:
-            jumps &= ~starts.squeeze(-1)
+        if starts is not None:  # an episode that is over goes on no more
+            jumps = (jumps | ends[:, :-1]) & ~starts.squeeze(-1)
         option_done = batch.get("next").get(self.option_done_key, None)
         left_open = torch.zeros_like(over) if option_done is None else over & ~option_done.squeeze(-1)
         if (jumps | left_open).any():  # one question, as a GPU has to be waited for
-            _refuse(jumps, left_open, episodes)
+            _refuse(jumps, left_open, episodes, ends)
         self._episode, self._over = episode[:, -1:].clone(), over[:, -1:].clone()
 
 
-def _refuse(jumps: Tensor, left_open: Tensor, episodes: Tensor) -> None:
+def _refuse(jumps: Tensor, left_open: Tensor, episodes: Tensor, ends: Tensor) -> None:
     if left_open.any():
         raise ValueError(
             "each end of an episode must end its option, got one that did not; a time limit must come before the "
             "agent's transforms: agent.transform(TransformedEnv(env, StepCounter(max_steps=...))), and not behind "
-            "them or as Collector(max_frames_per_traj=...)."
+            "them, as Collector(max_frames_per_traj=...) or as Collector(set_truncated=True)."
         )
     row, time = jumps.nonzero()[0].tolist()
+    if ends[row, time]:
+        raise ValueError(
+            f"batch must begin a new episode where one is over, got the middle of episode "
+            f"{int(episodes[row, time + 1])} after the end of episode {int(episodes[row, time])} (environment {row}, "
+            f"step {time}); collect without set_truncated=True."
+        )
     raise ValueError(
         f"batch must go on where the last one ended, in every environment, got the middle of episode "
         f"{int(episodes[row, time + 1])} after a step of episode {int(episodes[row, time])}, which was not over "

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from torchrl.data import Categorical, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 
 from hdrqn_torchrl.modules.features import (
     SMALLEST_IMAGE,
@@ -20,6 +20,8 @@ from hdrqn_torchrl.modules.features import (
 from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, ImageDecoder, ObservationPredictor
 from hdrqn_torchrl.modules.q_network import QNetwork
 from hdrqn_torchrl.modules.sizes import check_size, check_widths
+
+_LARGEST_FLOAT = 10.0  # what bounds of images in float32 are taken to be of about 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,6 +141,8 @@ def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | N
     if type(spec) is Categorical and not spec.dtype.is_floating_point and len(shape) == 2 and square:
         return None
     image = spec.dtype in (torch.uint8, torch.float32) and not isinstance(spec, Categorical | OneHot)
+    if isinstance(spec, Bounded) and spec.dtype == torch.float32:
+        image = bool(spec.space.high.max() <= _LARGEST_FLOAT)
     if image and len(shape) == 3 and square and shape[-1] >= SMALLEST_IMAGE:
         return None
     return (

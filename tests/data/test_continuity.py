@@ -74,6 +74,27 @@ class TestSeveralCollectors:
             for batch in batches[::2]:
                 continuity.check(batch)
 
+    @pytest.mark.parametrize(
+        ("name", "option", "message"),
+        [
+            (
+                "drqn",
+                "set_truncated",
+                "batch must begin a new episode where one is over, .* without set_truncated",
+            ),
+            ("v2", "set_truncated", r"each end of an episode must end its option, .* Collector\(set_truncated=True\)"),
+            ("drqn", "compact_obs", "batch must hold all that environment and policy wrote, .* without compact_obs"),
+            ("v3", "compact_obs", "batch must hold all that environment and policy wrote, .* without compact_obs"),
+        ],
+    )
+    def test_options_of_the_collector_that_change_what_happened_are_refused(self, name, option, message):
+        env = Corridor(4, length=7)
+        algorithm = build(name, env)
+        collector = make_collector_of(algorithm.transform(env), algorithm, **{option: True})
+        with pytest.raises(ValueError, match=message):
+            for batch, _ in zip(collector, range(3), strict=False):
+                algorithm.observe(batch)
+
     @pytest.mark.parametrize("shape", [(2, 4, 3), (12,)])
     def test_stacked_and_flat_batches_are_refused(self, shape):
         batch = many_batches(batches=1)[1][0]
