@@ -67,7 +67,7 @@ def test_the_values_of_a_subgoal_that_was_never_pursued(builder, settings):
         env = small_env(64, **CORRIDOR)
         algorithm = make(builder, env, sub=settings, sub_hindsight=hindsight)
         batch = play(algorithm, env, 30, lambda: {"action": torch.randint(4, (64,)), "subgoal": goal_0})
-        train(algorithm.learners["sub"], batch, updates=250)
+        train(algorithm.learners["sub"], batch, updates=400)
         errors[hindsight] = largest_errors(algorithm.learners["sub"])
     assert max(errors[True]) < 0.1 and errors[False][0] < 0.1 < 0.3 < errors[False][1]
 

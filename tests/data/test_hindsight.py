@@ -9,6 +9,7 @@ from helpers import batches_of, build, collect, random_play, small_env, tiny_set
 from tensordict import TensorDict
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
+from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import make_hdqn, make_hdrqn
 from hdrqn_torchrl.data import HindsightOptions, OptionExtractor, OptionHistory, StepSelector, relabel_subgoals
 from hdrqn_torchrl.modules import compact_network
@@ -674,3 +675,27 @@ class TestMetaLearner:
         second = told["next", "option_steps"] == 2
         returns = {round(value, 6) for value in told["next", "option_return"][second].tolist()} - {0.0}
         assert returns and returns <= ({0.5, 0.005} if smdp_discount else {1.0, 0.01})
+
+
+@pytest.mark.parametrize(("num_envs", "length"), [(3, 4), (5, 17)])
+def test_an_episode_that_comes_out_in_pieces_is_told_alike(num_envs, length):
+    """Each option on its own, as an episode without end is stored while it goes on."""
+
+    def rows(options):
+        columns = (("collector", "traj_ids"), "subgoal", "observation", ("next", "observation"))
+        numbers = (("next", "option_steps"), ("next", "option_return"))
+        flat = [options[key].reshape(len(options), -1).double() for key in (*columns, *numbers)]
+        return {tuple(row) for row in torch.cat(flat, 1).tolist()}
+
+    told = []
+    for max_held in (1, 1_000):
+        pursued = OptionExtractor(max_held=max_held)
+        retold = OptionExtractor(active_subgoal_key=keys.HINDSIGHT_SUBGOAL, max_held=max_held)
+        extractor = HindsightOptions(pursued, retold, gamma=0.9)
+        taken = [extractor(batch) for batch in batches_of(random_play(num_envs, 102), length)]
+        told.append(rows(torch.cat([options for options in taken if options is not None])))
+    pieces, whole = told
+    episodes = {row[0] for row in whole}
+    pieces = {row for row in pieces if row[0] in episodes}  # others are not over
+    assert {row for row in pieces if row[0] >= 0} == {row for row in whole if row[0] >= 0}
+    assert pieces <= whole and sum(row[0] < 0 for row in pieces) > 30
