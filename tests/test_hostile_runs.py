@@ -295,7 +295,7 @@ ATTACKS = {
     "a thousand million predictions": (settings(algo__prediction_steps=10**9), ("evaluate", "resume")),
     "a huge network": (settings(network__hidden_size=10**6), ("evaluate", "resume")),
     "a huge memory": (settings(algo__sub__capacity=10**12), ("evaluate", "resume")),
-    "a huge map": (settings(env__layout=["#" * 900] + ["#" + " " * 898 + "#"] * 900), ("evaluate", "resume")),
+    "a huge map": (settings(env__layout=["#" * 300] + ["#" + " " * 298 + "#"] * 300), ("evaluate", "resume")),
     "worlds that are text": (settings(env__num_goals="two"), ("evaluate",)),
     # states
     "moments of other shapes": (

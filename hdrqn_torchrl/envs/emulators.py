@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ale_py import ALEInterface
 
 Bytes = NDArray[np.uint8]
+LONGEST_STATE = 1 << 16  # bytes; the game's takes a few hundred
 
 
 class Snapshot(NamedTuple):
@@ -34,7 +35,16 @@ class Snapshot(NamedTuple):
 
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, Tensor]) -> Snapshot:
-        """What :meth:`tensors` was called on."""
+        """What :meth:`tensors` was called on.
+
+        Raises:
+            ValueError: if it can't be that.
+        """
+        shapes = {name: tuple(tensors[name].shape) for name in cls._fields}
+        only_bytes = all(tensors[name].dtype == torch.uint8 for name in cls._fields)
+        fits = len(shapes["state"]) == 1 and 0 < shapes["state"][0] <= LONGEST_STATE
+        if not (only_bytes and fits and shapes["ram"] == (128,) and shapes["screen"] == (210, 160, 3)):
+            raise ValueError(f"a stored emulator must be bytes of a state, a RAM and a screen, got {shapes}.")
         state, ram, screen = (tensors[name].cpu().numpy() for name in cls._fields)
         return cls(state.tobytes(), ram.copy(), screen.copy())
 

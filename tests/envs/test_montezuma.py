@@ -289,3 +289,16 @@ def test_wrong_settings(settings, message):
 
 def test_all_actions():
     assert MontezumaEnv(1, seed=0).action_spec.n == len(ALL_ACTIONS) == 18
+
+
+@pytest.mark.parametrize(
+    ("name", "shape"), [("ram", [127]), ("screen", [1, 160, 3]), ("state", [1 << 17]), ("state", [0])]
+)
+def test_a_stored_emulator_of_other_sizes_is_refused(name, shape):
+    from hdrqn_torchrl.envs.emulators import Snapshot
+
+    moment = {"state": torch.zeros(9, dtype=torch.uint8), "ram": torch.zeros(128, dtype=torch.uint8)}
+    moment["screen"] = torch.zeros(210, 160, 3, dtype=torch.uint8)
+    assert len(Snapshot.of_tensors(moment).state) == 9
+    with pytest.raises(ValueError, match="a stored emulator must be bytes of a state, a RAM and a screen, got "):
+        Snapshot.of_tensors(moment | {name: torch.zeros(shape, dtype=torch.uint8)})
