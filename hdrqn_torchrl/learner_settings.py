@@ -44,7 +44,7 @@ class LearnerSettings:
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be; targets are cut off above it. ``None``: what the task states, if it
-            states one; ``math.inf``: they are not cut off.
+            states one; ``"unbounded"``: they are not cut off.
         trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
         n_step: rewards of a target; 1: one-step targets.
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (see :func:`~hdrqn_torchrl.precision.choose_precision`).
@@ -71,7 +71,7 @@ class LearnerSettings:
     importance_exponent: float = 0.6
     loss_function: Literal["l2", "smooth_l1"] = "l2"
     double: bool = True
-    max_target: float | None = None
+    max_target: float | Literal["unbounded"] | None = None
     trace_decay: float = 0.0
     n_step: int = 1
     precision: Precision | Literal["auto"] = "fp32"

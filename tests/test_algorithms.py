@@ -2,13 +2,17 @@ import math
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
 from helpers import ALGORITHMS, build, collect, make_collector, parameter_distance, small_env, tiny_settings
+from hydra import compose, initialize_config_dir
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 from user_envs import Corridor
 
+import configuration
+from building import build_algorithm
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.data import FROM_STARTS, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.envs import MultiGoalGridEnv, Task
@@ -103,7 +107,7 @@ def test_the_policy_is_made_of_what_the_learners_train(name):
 
 def unbounded():
     """Settings of a learner whose targets may be any number."""
-    return tiny_settings(max_target=math.inf)
+    return tiny_settings(max_target="unbounded")
 
 
 def value_everything_at(learner, value):
@@ -810,3 +814,14 @@ class TestRepeatedActions:
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             steps = algorithm.transform(env).rollout(6, algorithm.policy, break_when_any_done=False)
         assert not steps["repeated_action"].any()
+
+
+def test_bounds_of_targets_in_the_settings_that_come_with_the_project():
+    found = {}
+    with initialize_config_dir(str(Path(configuration.__file__).parent / "conf"), version_base="1.3"):
+        for experiment in (None, "as_in_paper"):
+            chosen = [] if experiment is None else [f"experiment={experiment}"]
+            config = compose("config", overrides=["algo=v2", "env.num_envs=2", "env.num_goals=3", *chosen])
+            learners = build_algorithm(config)[1].learners
+            found[experiment] = [learners[level].loss.max_target for level in ("sub", "meta")]
+    assert found == {None: [1.0, 3.0], "as_in_paper": [math.inf, math.inf]}

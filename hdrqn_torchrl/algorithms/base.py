@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Literal
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -71,6 +72,13 @@ def stored_states(network: Controller, settings: LearnerSettings) -> list[Nested
     return network.state_keys if settings.stored_state else []
 
 
+def largest_target(setting: float | Literal["unbounded"] | None, stated: float) -> float:
+    """The bound of targets that a setting asks for; ``None``: what the task states."""
+    if setting is None:
+        return stated
+    return math.inf if setting == "unbounded" else setting
+
+
 def make_recurrent_loss(
     network: Controller,
     settings: LearnerSettings,
@@ -100,7 +108,7 @@ def make_recurrent_loss(
         train_exact_states=settings.train_exact_states,
         loss_function=settings.loss_function,
         double=settings.double,
-        max_target=largest_return if settings.max_target is None else settings.max_target,
+        max_target=largest_target(settings.max_target, largest_return),
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
         lookahead=settings.lookahead(),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from typing import Literal
 
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, largest_target, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.envs import Task
@@ -64,7 +65,7 @@ def make_v3(
     wrong_subgoal_reward: float = 0.0,
     hazard_reward: float = -1.0,
     max_option_steps: int | None = None,
-    max_meta_target: float | None = None,
+    max_meta_target: float | Literal["unbounded"] | None = None,
     prediction_steps: int = 4,
     prediction_weight: float = 0.1,
 ) -> Algorithm:
@@ -91,7 +92,7 @@ def make_v3(
         sub_gamma, meta_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, prediction_weight: see
             :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
         max_meta_target: largest return of the task there can be; the meta level's targets are cut off above it.
-            ``None``: what the task states, if it states one; ``math.inf``: they are not cut off.
+            ``None``: what the task states, if it states one; ``"unbounded"``: they are not cut off.
         wrong_subgoal_reward: of the sub level, for attaining another subgoal than the one in question. Below 0 it keeps
             the agent from spoiling what comes later (the grid tasks have -0.5); but where one subgoal is needed for
             another, such as the key for the door, it forbids the only way: docs/v3.md has what was measured.
@@ -158,7 +159,7 @@ def make_v3(
         double=learner.double,
         all_subgoals=all_subgoals,
         intra_option=intra_option,
-        max_meta_target=has.task.largest_extrinsic_return if max_meta_target is None else max_meta_target,
+        max_meta_target=largest_target(max_meta_target, has.task.largest_extrinsic_return),
         min_meta_target=has.task.smallest_extrinsic_return,
         prediction_weight=prediction_weight,
         burn_in=learner.burn_in,
