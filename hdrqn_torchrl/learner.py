@@ -289,6 +289,7 @@ class Learner:
         self._check_optimizer(state["optimizer"])
         self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
+        _lay_out_like_parameters(self.optimizer)
         self.extract.load_state_dict(state["extract"])
         self.updates, self.frames = state["updates"], state["frames"]
         if "buffer" in state:
@@ -357,3 +358,14 @@ def _group(parameters: Mapping[str, Parameter], separate: Mapping[str, float]) -
                 f"{name!r}: {rate}, which {len(members)} parameters have; look at network.named_parameters()."
             )
     return [(1.0, rest), *groups.values()]
+
+
+def _lay_out_like_parameters(optimizer: torch.optim.Optimizer) -> None:
+    """Gives loaded moments the strides of their parameters: fused Adam goes through the memory of both side by side.
+
+    Files hold contiguous tensors, and convolutions have their channels last.
+    """
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if isinstance(value, Tensor) and value.shape == parameter.shape:
+                state[name] = torch.empty_like(parameter).copy_(value)

@@ -129,8 +129,8 @@ class Trainer:
     def _receive(self, batch: TensorDictBase) -> None:
         """Counts and stores a collected batch ``[N, T]``."""
         check_finite(batch, self.frames)
-        self.algorithm.observe(batch)
         self.frames += batch.numel()
+        self.algorithm.observe(batch)
         finished = self._tracker.finished(batch)
         self.episodes += len(finished)
         self._window.add_episodes(finished)

@@ -8,9 +8,10 @@ from tensordict import TensorDict
 
 from hdrqn_torchrl import learner as learner_module
 from hdrqn_torchrl.algorithms import make_recurrent_loss
+from hdrqn_torchrl.checkpoint import Checkpoints
 from hdrqn_torchrl.finite import NonFiniteError
 from hdrqn_torchrl.learner import Learner, LearnerSettings
-from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController
+from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController, paper_network
 
 
 def make_learner(
@@ -589,6 +590,27 @@ class TestState:
         state = deepcopy(learner.state_dict()) | {"frames": 10**12}
         with pytest.raises(ValueError, match="updates must make up for its frames, got 0 for 1000000000000"):
             learner.load_state_dict(state)
+
+
+def test_a_network_with_convolutions_learns_on_as_if_it_had_not_been_saved(tmp_path):
+    """Their weights have the channels last, and what a file holds has not: Adam's moments must follow the weights."""
+    torch.manual_seed(0)
+    first, second = (build("drqn", small_env(4), paper_network(8)).learners["flat"] for _ in range(2))
+    (batch,) = collect(build("drqn", small_env(4), paper_network(8)), small_env(4), 16)
+    first.store(batch)
+    for _ in range(2):
+        first.update(first.sample())
+    path = Checkpoints(tmp_path).save({"learner": first}, step=1)
+    Checkpoints(tmp_path).load({"learner": second}, path)
+    sample = first.sample()
+    for learner in (first, second):
+        learner.update(sample.clone())
+    for (name, one), (_, other) in zip(
+        first.network.named_parameters(), second.network.named_parameters(), strict=True
+    ):
+        assert torch.equal(one, other), name
+        assert first.optimizer.state[one]["exp_avg"].stride() == one.stride()
+        assert second.optimizer.state[other]["exp_avg"].stride() == other.stride()
 
 
 class TestShapes:
