@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Set
@@ -53,7 +55,7 @@ def plan(config: DictConfig, folder: Path) -> Plan:
     if config.resume is None:
         if holds_run(folder):
             raise SettingsError(
-                f"{folder} already holds a run, which would be overwritten; `python train.py resume={folder}` goes on "
+                f"{folder} already holds a run, which would be overwritten; `{command(folder, config)}` goes on "
                 "with it, any other hydra.run.dir starts a new one."
             )
         return Plan(folder, config, choices, resumed=False)
@@ -75,6 +77,17 @@ def plan(config: DictConfig, folder: Path) -> Plan:
             folder.rmdir()
             folder.parent.rmdir()
     return Plan(run, config, read_choices(run) or choices, resumed=True, checkpoint=checkpoint)
+
+
+def command(folder: Path, config: DictConfig) -> str:
+    """What goes on with a run, as it is to be typed: quoted for the shell and for Hydra, with what one must trust."""
+    value = str(folder)
+    if re.fullmatch(r"[\w ./:-]+", value, re.ASCII) is None:
+        value = '"' + value.replace('"', '\\"') + '"'
+    words = [f"resume={value}"]
+    if targets := list(config.get("allowed_targets") or ()):
+        words.append(f"allowed_targets=[{','.join(map(str, targets))}]")
+    return shlex.join(["python", "train.py", *words])
 
 
 def holds_run(folder: Path) -> bool:

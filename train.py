@@ -22,7 +22,7 @@ import sweeps
 from building import build, build_algorithm, build_env, explain, plain
 from configuration import RunError, SettingsError, check, pick_device, resolved
 from hdrqn_torchrl.run_files import check_file, remove, write_whole
-from resuming import Plan, holds_run, plan, record
+from resuming import Plan, command, holds_run, plan, record
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -46,7 +46,7 @@ def main(config: DictConfig) -> float:
         return train(run)
     except KeyboardInterrupt as stop:
         folder = folder if run is None else run.folder
-        print(f"{str(stop) or 'stopped'}; `python train.py resume={folder}` goes on", file=sys.stderr)
+        print(f"{str(stop) or 'stopped'}; `{command(folder, config)}` goes on", file=sys.stderr)
         sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
     except Exception as error:
         if run is None and not holds_run(folder):
@@ -91,7 +91,7 @@ def in_words(run: Plan) -> Iterator[None]:
     except (CheckpointError, NonFiniteError) as error:
         raise RunError(str(error)) from error
     except OSError as error:
-        remedy = f"mend that, then `python train.py resume={run.folder}` goes on from the last checkpoint"
+        remedy = f"mend that, then `{command(run.folder, run.config)}` goes on from the last checkpoint"
         raise RunError(f"{error}; {remedy}.") from error
 
 

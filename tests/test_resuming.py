@@ -3,18 +3,20 @@
 import json
 import os
 import re
+import shlex
 from functools import cache
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 from test_configuration import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
 
 import resuming
 from configuration import SettingsError, check, resolved
-from resuming import Plan, differences, find_same, holds_run, plan, record, split
+from resuming import Plan, command, differences, find_same, holds_run, plan, record, split
 
 
 @cache
@@ -72,6 +74,17 @@ class TestANewRun:
             SettingsError, match=r"^taken already holds a run, .*`python train\.py resume=taken` goes on"
         ):
             plan_for(folder=folder)
+
+    @pytest.mark.parametrize("name", ["run", "a b", "a#b", "a=b,c", "(a) [b]", "jörg's", 'a"b', "~a", "@a%b"])
+    def test_the_command_that_goes_on_can_be_typed_as_it_is_printed(self, name):
+        config = OmegaConf.create({"allowed_targets": ["mine.Env", "mine.network"]})
+        words = shlex.split(command(Path(name), config))
+        resume, allowed = OverridesParser.create().parse_overrides(words[2:])
+        assert words[:2] == ["python", "train.py"]
+        assert str(resume.value()) == name and allowed.value() == ["mine.Env", "mine.network"]
+
+    def test_the_command_that_goes_on_names_no_builders_where_none_were_added(self):
+        assert command(Path("out/run"), OmegaConf.create({})) == "python train.py resume=out/run"
 
     def test_any_other_file_there_is_no_run(self):
         Path("used").mkdir()

@@ -154,7 +154,7 @@ class FullyConnectedFeatures(Features):
         widths: sizes of the dense layers; the paper has four of 256.
 
     Shapes:
-        ``[*, in_features]`` -> ``[*, widths[-1]]``.
+        ``[*, in_features]`` numbers or flags (one-hot vectors, for instance) -> ``[*, widths[-1]]``.
     """
 
     def __init__(self, in_features: int, widths: tuple[int, ...] = (256, 256, 256, 256)) -> None:
@@ -164,6 +164,8 @@ class FullyConnectedFeatures(Features):
         self.out_features = widths[-1]
 
     def forward(self, vector: Tensor) -> Tensor:
+        if not vector.is_floating_point():
+            vector = vector.to(next(self.dense.parameters()).dtype)
         return _on_rows(self.dense, vector)
 
 

@@ -98,3 +98,8 @@ class TestVectors:
         shapes = [tuple(p.shape) for p in features.parameters() if p.ndim == 2]
         assert shapes == [(256, 10), (256, 256), (256, 256), (256, 256)]
         assert features(torch.zeros(2, 3, 10)).shape == (2, 3, features.out_features)
+
+    @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64])
+    def test_fully_connected_features_read_one_hot_vectors_and_numbers_of_any_type(self, dtype):
+        features, one_hot = FullyConnectedFeatures(3, (4,)), torch.eye(3)
+        assert torch.equal(features(one_hot.to(dtype)), features(one_hot))
