@@ -65,7 +65,7 @@ class Continuity:
             raise ValueError(f"batch must hold the same {len(self._episode)} environments, got {len(episode)}.")
         over = batch.get("next").get(keys.DONE).squeeze(-1)
         before = episode[:, :1] if self._episode is None else self._episode
-        over_before = over[:, :1] if self._over is None else self._over
+        over_before = torch.zeros_like(over[:, :1]) if self._over is None else self._over
         episodes, ends = torch.cat([before, episode], 1), torch.cat([over_before, over], 1)
         jumps = (episodes[:, 1:] != episodes[:, :-1]) & ~ends[:, :-1]
         starts = batch.get(self.init_key, None)
