@@ -133,6 +133,8 @@ class Learner:
             NonFiniteError: as :meth:`check_finite`.
         """
         self.check_finite()
+        if batch.device != self.device:  # a collector that was told no device numbers its episodes on the host
+            batch = batch.to(self.device)
         self._continuity.check(batch)
         self.frames += batch.numel()
         self._drawn = []

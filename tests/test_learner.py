@@ -614,6 +614,13 @@ def test_a_network_with_convolutions_learns_on_as_if_it_had_not_been_saved(tmp_p
 
 
 class TestShapes:
+    def test_all_of_a_batch_is_stored_from_the_devices_of_the_learner(self):
+        """TorchRL's Collector leaves the numbers of episodes on the host unless it is told a device."""
+        learner, seen = make_learner(), []
+        extract, learner.extract = learner.extract, lambda batch: extract(seen.append(batch.device) or batch)
+        learner.store(make_batch())
+        assert seen == [learner.device] and make_batch().device is None
+
     def test_a_batch_of_other_environments_is_refused(self):
         learner = make_learner(num_envs=2)
         learner.store(make_batch())
