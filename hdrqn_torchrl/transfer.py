@@ -29,12 +29,12 @@ def find_weights(place: Path, which: str = "best") -> Path:
     Raises:
         ValueError: if there is none.
     """
-    if place.is_file() or place.parent.name == "checkpoints":
-        return place
     try:
+        if place.is_file() or place.parent.name == "checkpoints":
+            return place
         checkpoints = Checkpoints(place / "checkpoints")
         path = checkpoints.best() if which == "best" else checkpoints.newest()
-    except CheckpointError as error:
+    except (CheckpointError, OSError) as error:
         raise ValueError(f"init_from can't be read: {error}") from error
     if path is None:
         raise ValueError(f"init_from must be a run folder, a checkpoint or a weights file, got {place}; it is none.")

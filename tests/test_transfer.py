@@ -1,4 +1,5 @@
 import shutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -91,6 +92,11 @@ class TestFinding:
         (tmp_path / "text").write_text("text")
         with pytest.raises(ValueError, match="must be a safetensors file"):
             load_weights_of(tmp_path / "text")
+
+    @pytest.mark.parametrize("place", ["/dev/null", "x" * 5000])
+    def test_a_device_or_a_name_that_cannot_be_looked_up_is_refused_as_a_setting(self, place):
+        with pytest.raises(ValueError, match=r"^init_from can't be read: "):
+            find_weights(Path(place))
 
     def test_damage_is_refused(self, run, tmp_path):
         folder, _ = run
