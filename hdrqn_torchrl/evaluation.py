@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -34,6 +35,8 @@ _FIGURES = {
 }
 LONGEST_EPISODE = 10_000
 """Steps after which an episode of unknown length is taken to have no end; tasks of longer ones state their length."""
+PATIENCE = 1_000
+"""Steps after which it is said that this is being waited for."""
 
 
 class Observer(Protocol):
@@ -271,7 +274,14 @@ def _play_once(
     playing = torch.ones(env.batch_size, dtype=torch.bool, device=tensordict.device)
     episodes: TensorDictBase | None = None
     longest = max_steps or task.max_steps or LONGEST_EPISODE
-    for _ in range(longest):
+    for step in range(longest):
+        if step == PATIENCE and max_steps is None and task.max_steps is None:
+            warnings.warn(
+                f"env should end its episodes or state how long they are, got {int(playing.sum())} of {len(playing)} "
+                f"that have not ended after {step:,} steps; an evaluation waits for {longest:,}, or for max_steps "
+                "(evaluation.max_steps on the command line).",
+                stacklevel=4,
+            )
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))
         after = tensordict.get("next")
         sums = tracker.add(after)

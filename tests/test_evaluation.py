@@ -1,3 +1,5 @@
+import warnings
+
 import pytest
 import torch
 from helpers import LEFT, RIGHT, build, collect, small_env, subgoal_env
@@ -202,7 +204,7 @@ class TestTasksOfOthers:
         assert set(result) == set(result["intervals"]) | {"episodes", "per_subgoal", "intervals"}
         assert len(result["per_subgoal"]) == (0 if name == "dqn" else 2)
 
-    def test_large_rewards_are_no_GoalsInOrder(self):
+    def test_large_rewards_are_no_goals_in_order(self):
         """Ten a goal, and many of them: the rate was 13.5 once."""
         result = self.played(pays=27.0, without=("success",))
         assert "in_order_rate" not in result
@@ -217,6 +219,14 @@ class TestTasksOfOthers:
         with pytest.raises(ValueError, match="got 4 of 4 that had not ended after 5 steps"):
             self.played(length=6, task=Task(max_steps=5))
         assert self.played(length=41, task=Task(max_steps=41))["steps_mean"] == 41
+
+    def test_a_long_wait_for_the_end_of_an_episode_is_told(self, monkeypatch):
+        monkeypatch.setattr("hdrqn_torchrl.evaluation.PATIENCE", 20)
+        with pytest.warns(UserWarning, match=r"got 4 of 4 that have not ended after 20 steps; .* or for max_steps"):
+            self.played(length=30)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            self.played(length=30, task=Task(max_steps=30))
 
     @pytest.mark.parametrize(("length", "steps", "cut"), [(None, 9, 1.0), (6, 6, 0.0), (9, 9, 0.0)])
     def test_evaluations_can_cut_episodes_off_and_say_so(self, length, steps, cut):

@@ -148,8 +148,8 @@ def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | N
     return (
         "a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] of "
         f"S >= {SMALLEST_IMAGE} pixels, uint8 or float32 of about 1",
-        "ToTensorImage and Resize make such images; for anything else give Architecture(observation_features=...) a "
-        "feature extractor",
+        "integers are codes where their spec is Categorical, and ToTensorImage and Resize make such images; for "
+        "anything else give Architecture(observation_features=...) a feature extractor",
     )
 
 
