@@ -67,9 +67,13 @@ def _refusal(place: Path, mode: int) -> RunFileError:
         (stat.S_ISLNK, "a symbolic link"),
         (stat.S_ISFIFO, "a pipe"),
         (stat.S_ISDIR, "a folder"),
-        (stat.S_ISREG, "a file with other names (hard links)"),
+        (stat.S_ISREG, "a file"),
     )
     kind = next((name for is_kind, name in kinds if is_kind(mode)), "a device or socket")
+    return _refusal_of(place, kind)
+
+
+def _refusal_of(place: Path, kind: str) -> RunFileError:
     return RunFileError(
         f"{place} must be what a run leaves there, got {kind}; nothing in a run folder leads out of it."
     )
@@ -111,6 +115,8 @@ def open_descriptor(path: Path, flags: int, *, root: Path | None = None) -> int:
     if stat.S_ISREG(found.st_mode) and (found.st_nlink == 1 or not flags & (os.O_WRONLY | os.O_RDWR)):
         return descriptor
     os.close(descriptor)
+    if stat.S_ISREG(found.st_mode):
+        raise _refusal_of(path, "a file with other names (hard links)")
     raise _refusal(path, found.st_mode)
 
 

@@ -145,5 +145,5 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
 
     begin, train.build_run, train.begin = train.begin, build_run, noted_begin
     train.record, train.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
-    train.train(Plan(folder, OmegaConf.create({"threads": 1}), {}, resumed=True))
+    train.train(Plan(folder, OmegaConf.create({"threads": 1, "init_from": None}), {}, resumed=True))
     diary.note("done")

@@ -303,7 +303,7 @@ class TestLoadAgent:
     def test_checkpoints_that_are_no_folder(self, tmp_path):
         write_run(tmp_path, weights=False)
         (tmp_path / "checkpoints").write_text("")
-        with pytest.raises(SettingsError, match="has not saved anything yet"):
+        with pytest.raises(SettingsError, match="checkpoints must be what a run leaves there, got a file;"):
             load_agent(tmp_path)
 
 

@@ -1,3 +1,5 @@
+from copy import deepcopy
+
 import pytest
 import torch
 from helpers import small_env, tiny_settings
@@ -188,7 +190,7 @@ class TestPolicy:
     def test_each_level_explores_on_its_own(self):
         td = root(rows=1).expand(400).clone()
         td["option_init"] = torch.ones(400, 1, dtype=torch.bool)
-        for sub, meta in ((self.ALWAYS, None), (None, self.ALWAYS), (self.NEVER, self.NEVER)):
+        for sub, meta in ((self.ALWAYS, None), (None, self.ALWAYS), (self.NEVER, deepcopy(self.NEVER))):
             policy = AllSubgoalsPolicy(make_network(), sub, meta)
             with set_exploration_type(ExplorationType.RANDOM):
                 out = policy(td.clone())
@@ -323,7 +325,7 @@ class TestInTheEnvironment:
         learner.extract.root_keys += ["time", "env"]
         learner.store(batch)
         sample = learner.sample()
-        assert sample.shape == (32, 5) and (~sample["is_init"][:, 0]).sum() > 10
+        assert sample.shape == (32, 4 + learner.loss.lookahead) and (~sample["is_init"][:, 0]).sum() > 10
         real, place = sample["collector", "mask"], (sample["env"], sample["time"])
         assert not real.all()
         for values, acted_by in zip(self.unrolled(sample), (self.action_value, self.subgoal_value), strict=True):
