@@ -18,7 +18,7 @@ from hdrqn_torchrl.comparison import GREEDY, PAPER, Panel
 from resuming import FREE
 
 _IRRELEVANT = (*FREE, "logger", "device", "threads", "log_frames")  # to what is learned
-_BOUNDS = ("max_target", "max_meta_target")  # null: the largest return that the task states
+_LEFT_TO_THE_TASK = ("max_target", "max_meta_target", "slice_len")  # null: as the task states its returns and episodes
 CONF = str(Path(__file__).parent / "conf")
 ALGORITHMS = (  # the first three are the paper's
     Ordered("return", ["v2", "v1"]),
@@ -231,11 +231,12 @@ def flat(settings: Any, path: str = "") -> dict[str, Any]:
 def is_run_of(job: Job, run: dict[str, Any]) -> bool:
     """Whether a run was trained with a job's settings.
 
-    Settings that are newer than the run are not asked for, nor bounds that the job leaves to the task: older runs have
-    them as numbers.
+    Settings that are newer than the run are not asked for, nor what the job leaves to the task: older runs have that as
+    numbers, and no bound as ``null``.
     """
-    return all(job.settings.get(key) == value or _is_left_to_the_task(job, key) for key, value in run.items())
+    return all(job.settings.get(key) == value or _is_left_to_the_task(job, key, value) for key, value in run.items())
 
 
-def _is_left_to_the_task(job: Job, key: str) -> bool:
-    return key.rpartition(".")[2] in _BOUNDS and job.settings.get(key, "") is None
+def _is_left_to_the_task(job: Job, key: str, found: Any) -> bool:
+    asked = job.settings.get(key, "")
+    return key.rpartition(".")[2] in _LEFT_TO_THE_TASK and (asked is None or (asked == "unbounded" and found is None))

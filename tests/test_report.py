@@ -245,14 +245,17 @@ def test_the_kept_runs_are_still_those_of_their_study():
     with ExitStack() as stack:
         kept = report.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
         found, missing = report.runs_of_jobs("gridworld", "small", kept)
+        of_authors, _ = report.runs_of_jobs("authors_choices", "small", kept)
     assert (len(found), missing) == (18, 0)
     assert len({run.entry.run.folder for _, run in found}) == 18
+    assert len(of_authors) > 0
 
 
 def test_a_bound_that_a_job_leaves_to_the_task_is_not_asked_for():
     job = Job({}, {"algo.sub.max_target": None, "algo.gamma": 0.9})
     assert is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.9})
     assert not is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.99})
-    unbounded = Job({}, {"algo.sub.max_target": float("inf")})
+    unbounded = Job({}, {"algo.sub.max_target": "unbounded"})
     assert not is_run_of(unbounded, {"algo.sub.max_target": 1.0})
+    assert is_run_of(unbounded, {"algo.sub.max_target": None})  # what it was called before
     assert not is_run_of(Job({}, {}), {"algo.sub.max_target": 1.0})

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Literal
 
@@ -59,6 +60,17 @@ def copies_of(*transforms: Transform) -> Callable[[], Compose]:
 
 def _copy(transforms: Sequence[Transform]) -> Compose:
     return Compose(*deepcopy(transforms))
+
+
+@contextmanager
+def settings_named(name: str) -> Iterator[None]:
+    """Complaints about a level's :class:`LearnerSettings` are told under the argument that holds them."""
+    try:
+        yield
+    except ValueError as error:
+        if str(error).partition(" ")[0] in {each.name for each in fields(LearnerSettings)}:
+            raise ValueError(f"{name}.{error}") from error
+        raise
 
 
 def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:

@@ -8,7 +8,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import StepSelector
 from hdrqn_torchrl.learner import Learner, LearnerSettings
@@ -53,23 +53,24 @@ def make_drqn(
         has.observation, num_actions=has.num_actions, recurrent=recurrent, prediction_steps=prediction_steps
     )
     policy = SubController(network, exploration, subgoal_key=None, init_key=keys.IS_INIT).to(env.device)
-    flat = Learner(
-        policy,
-        learner,
-        extract=StepSelector(
-            root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
-            next_keys=[keys.OBSERVATION, keys.REWARD],
-        ),
-        loss=make_recurrent_loss(
+    with settings_named("learner"):
+        flat = Learner(
             policy,
             learner,
-            gamma=gamma,
-            largest_return=has.task.largest_return,
-            prediction_weight=prediction_weight,
-        ),
-        num_envs=has.num_envs,
-        episode_len=has.task.max_steps,
-    )
+            extract=StepSelector(
+                root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
+                next_keys=[keys.OBSERVATION, keys.REWARD],
+            ),
+            loss=make_recurrent_loss(
+                policy,
+                learner,
+                gamma=gamma,
+                largest_return=has.task.largest_return,
+                prediction_weight=prediction_weight,
+            ),
+            num_envs=has.num_envs,
+            episode_len=has.task.max_steps,
+        )
     return Algorithm(
         policy=policy,
         learners={"flat": flat},

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import (
     FROM_STARTS,
@@ -167,68 +167,76 @@ def make_hdrqn(
         root_extra, next_extra = [keys.SUBGOAL_MASK], [keys.ATTAINED, *has.hazard_keys]
     policy = HierarchicalPolicy(meta_controller, sub_controller, read_last_observation=reads_last).to(env.device)
     starts = [keys.IS_INIT] if sub.sampling in FROM_STARTS else []
-    sub_learner = Learner(
-        sub_controller,
-        sub,
-        extract=StepSelector(
-            root_keys=[
-                keys.OBSERVATION,
-                keys.ACTION,
-                keys.OPTION_INIT,
-                *starts,
-                *stored_states(sub_controller, sub),
-                *root_extra,
-            ],
-            next_keys=[keys.OBSERVATION, keys.INTRINSIC_REWARD, keys.OPTION_DONE, keys.OPTION_TERMINATED, *next_extra],
-            subgoal_key=keys.SUBGOAL,
-        ),
-        loss=make_recurrent_loss(
+    with settings_named("sub"):
+        sub_learner = Learner(
             sub_controller,
             sub,
-            gamma=gamma,
-            largest_return=largest_intrinsic_return(
-                hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
+            extract=StepSelector(
+                root_keys=[
+                    keys.OBSERVATION,
+                    keys.ACTION,
+                    keys.OPTION_INIT,
+                    *starts,
+                    *stored_states(sub_controller, sub),
+                    *root_extra,
+                ],
+                next_keys=[
+                    keys.OBSERVATION,
+                    keys.INTRINSIC_REWARD,
+                    keys.OPTION_DONE,
+                    keys.OPTION_TERMINATED,
+                    *next_extra,
+                ],
+                subgoal_key=keys.SUBGOAL,
             ),
-            loss_keys={
-                "reward": keys.INTRINSIC_REWARD,
-                "done": keys.OPTION_DONE,
-                "terminated": keys.OPTION_TERMINATED,
-                "init": keys.OPTION_INIT,
-                "eligible": keys.ELIGIBLE if sub_hindsight else None,
-            },
-            prediction_weight=prediction_weight,
-        ),
-        num_envs=has.num_envs,
-        episode_len=has.task.max_steps,
-        refresh=relabel,
-    )
-    meta_learner = Learner(
-        meta_controller,
-        meta,
-        extract=_option_extract(
-            input_keys=meta_keys,
-            mask_key=mask_key,
-            at_end=partial(_read_last, sub_controller) if reads_last else None,
-            state_keys=stored_states(meta_controller, meta),
-            history_steps=refresh_steps,
-            hindsight_gamma=option_gamma if meta_hindsight else None,
-            max_held=_held_options(has.task, meta),
-        ),
-        loss=make_recurrent_loss(
+            loss=make_recurrent_loss(
+                sub_controller,
+                sub,
+                gamma=gamma,
+                largest_return=largest_intrinsic_return(
+                    hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
+                ),
+                loss_keys={
+                    "reward": keys.INTRINSIC_REWARD,
+                    "done": keys.OPTION_DONE,
+                    "terminated": keys.OPTION_TERMINATED,
+                    "init": keys.OPTION_INIT,
+                    "eligible": keys.ELIGIBLE if sub_hindsight else None,
+                },
+                prediction_weight=prediction_weight,
+            ),
+            num_envs=has.num_envs,
+            episode_len=has.task.max_steps,
+            refresh=relabel,
+        )
+    with settings_named("meta"):
+        meta_learner = Learner(
             meta_controller,
             meta,
-            gamma=gamma,
-            largest_return=has.task.largest_extrinsic_return,
-            loss_keys={
-                "action": keys.SUBGOAL,
-                "reward": keys.OPTION_RETURN,
-                "steps": keys.OPTION_STEPS if smdp_discount else None,
-                "action_mask": mask_key,
-            },
-        ),
-        episode_len=has.task.max_steps,
-        refresh=refresh,
-    )
+            extract=_option_extract(
+                input_keys=meta_keys,
+                mask_key=mask_key,
+                at_end=partial(_read_last, sub_controller) if reads_last else None,
+                state_keys=stored_states(meta_controller, meta),
+                history_steps=refresh_steps,
+                hindsight_gamma=option_gamma if meta_hindsight else None,
+                max_held=_held_options(has.task, meta),
+            ),
+            loss=make_recurrent_loss(
+                meta_controller,
+                meta,
+                gamma=gamma,
+                largest_return=has.task.largest_extrinsic_return,
+                loss_keys={
+                    "action": keys.SUBGOAL,
+                    "reward": keys.OPTION_RETURN,
+                    "steps": keys.OPTION_STEPS if smdp_discount else None,
+                    "action_mask": mask_key,
+                },
+            ),
+            episode_len=has.task.max_steps,
+            refresh=refresh,
+        )
 
     subgoals = SubgoalTransform(
         num_subgoals,

@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, largest_target, stored_states
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, largest_target, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.envs import Task
@@ -168,27 +168,29 @@ def make_v3(
         loss_function=learner.loss_function,
         stored_state=learner.stored_state,
     )
-    stored = StepSelector(
-        root_keys=[
-            keys.OBSERVATION,
-            keys.PREVIOUS_ACTION,
-            keys.ACTION,
-            keys.IS_INIT,
-            keys.OPTION_INIT,
-            keys.SUBGOAL_MASK,
-            *stored_states(policy, learner),
-        ],
-        next_keys=[keys.ATTAINED, *has.hazard_keys, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
-    )
-    trained = Learner(
-        policy,
-        learner,
-        extract=stored,
-        loss=loss,
-        num_envs=has.num_envs,
-        episode_len=has.task.max_steps,
-        separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
-    )
+    with settings_named("learner"):
+        stored = StepSelector(
+            root_keys=[
+                keys.OBSERVATION,
+                keys.PREVIOUS_ACTION,
+                keys.ACTION,
+                keys.IS_INIT,
+                keys.OPTION_INIT,
+                keys.SUBGOAL_MASK,
+                *stored_states(policy, learner),
+            ],
+            next_keys=[keys.ATTAINED, *has.hazard_keys, keys.EXTRINSIC_REWARD, keys.ACTIVE_SUBGOAL],
+        )
+    with settings_named("learner"):
+        trained = Learner(
+            policy,
+            learner,
+            extract=stored,
+            loss=loss,
+            num_envs=has.num_envs,
+            episode_len=has.task.max_steps,
+            separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
+        )
 
     subgoals = SubgoalTransform(
         num_subgoals,
