@@ -318,6 +318,6 @@ def _is_text(schema: type, key: str, value: str) -> bool:
     """
     hint = get_type_hints(schema).get(key)
     if hint is Any:
-        optional = getattr(schema, key, MISSING) is None
+        optional = getattr(schema, key, MISSING) != MISSING  # then it may be null
         return not (value.startswith("[") and value.endswith("]")) and not (optional and value == "null")
     return hint in (str, str | None)
