@@ -235,7 +235,7 @@ def wait_for_row(folder, frames, process):
     """Until the only run below ``folder`` has a log point at or after ``frames``; returns its folder."""
     deadline = time.monotonic() + 100
     while time.monotonic() < deadline and process.is_alive():
-        for metrics in folder.rglob("metrics.csv"):
+        for metrics in [*folder.glob("*/metrics.csv"), *folder.glob("*/*/*/metrics.csv")]:  # checkpoints come and go
             if any(int(row["frames"]) >= frames for row in table(metrics.parent)):
                 return metrics.parent
         time.sleep(0.01)
