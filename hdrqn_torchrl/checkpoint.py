@@ -206,7 +206,8 @@ class Checkpoints:
 
     def best(self) -> Path | None:
         """The whole checkpoint with the best score, or the newest if none has one."""
-        return max(self._whole(), key=lambda path: _score(path) or _UNSCORED, default=None) or self.newest()
+        scores = {path: score for path in self._whole() if (score := _score(path)) is not None}
+        return max(scores, key=lambda path: scores[path], default=None) or self.newest()
 
     def go_back_to(self, step: int) -> None:
         """Removes later checkpoints, as their steps will be done again, and damaged ones, which would count as kept."""

@@ -148,6 +148,11 @@ class TestRetention:
         self.save(checkpoints, (10, -2.0), (20, -1.0), (30, -1.0), 40)
         assert checkpoints.best().name.endswith("30")
 
+    def test_a_score_of_nothing_is_a_score(self, tmp_path):
+        checkpoints = Checkpoints(tmp_path, keep_last=5)
+        self.save(checkpoints, (10, -1.0), (20, 0.0), 30)
+        assert checkpoints.best().name.endswith("20")
+
     def test_a_step_saved_twice_is_replaced(self, tmp_path):
         checkpoints, copy = Checkpoints(tmp_path), State()
         self.save(checkpoints, 10)
