@@ -2,7 +2,7 @@
 
 import torch
 
-from hdrqn_torchrl.envs.ceilings import MEASURED_EPISODES, measure, standard_tasks
+from hdrqn_torchrl.envs.grid.ceilings import MEASURED_EPISODES, measure, standard_tasks
 
 if __name__ == "__main__":
     torch.set_num_threads(1)

@@ -14,13 +14,13 @@ from pathlib import Path
 import torch
 
 from hdrqn_torchrl.algorithms import make_drqn, make_hdrqn, make_v3
-from hdrqn_torchrl.checkpoint import Checkpoints
-from hdrqn_torchrl.collectors import ResumableCollector
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.learner import LearnerSettings
-from hdrqn_torchrl.logging import RunLogger
+from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.trainer import Trainer
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.collectors import ResumableCollector
+from hdrqn_torchrl.runs.logging import RunLogger
+from hdrqn_torchrl.runs.trainer import Trainer
 
 INTERVAL_FRAMES = 50_000  # of conf/config.yaml
 BUILDERS = {

@@ -21,7 +21,7 @@ from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 
 from hdrqn_torchrl.algorithms import Algorithm, make_hdrqn
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.envs.grid_rules import GridRules, GridState
+from hdrqn_torchrl.envs.grid.rules import GridRules, GridState
 from hdrqn_torchrl.modules import EpsilonGreedy, QNetwork, compact_network, paper_network
 
 GAMMA, MAX_STEPS, NUM_GOALS = 0.99, 50, 2

@@ -21,7 +21,7 @@ from torchrl.collectors import Collector
 
 from hdrqn_torchrl.algorithms import Algorithm, make_hdrqn
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import QNetwork, compact_network, paper_network
 
 Batch = dict[str, Tensor]

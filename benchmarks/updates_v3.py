@@ -23,7 +23,7 @@ from torchrl.collectors import Collector
 
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_v3
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.learner import Learner
+from hdrqn_torchrl.learning import Learner
 from hdrqn_torchrl.modules import AllSubgoalsNetwork, compact_network
 
 Batch = dict[str, Tensor]

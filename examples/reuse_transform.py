@@ -27,7 +27,7 @@ from torchrl.envs import Compose, GymWrapper, InitTracker, SerialEnv, Transforme
 from hdrqn_torchrl import modules
 from hdrqn_torchrl.algorithms import make_recurrent_loss
 from hdrqn_torchrl.data import OptionExtractor, StepSelector
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 try:

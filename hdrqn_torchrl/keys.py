@@ -6,6 +6,8 @@ after the batch dimensions, ``G`` is the number of subgoals and ``H`` the size o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 # Written by the environment.
 OBSERVATION = "observation"  # [V, V] uint8 cell codes, or [3, 44, 44] uint8 pixels: o_t
 REWARD = "reward"  # [1] float32: total reward of the task
@@ -50,3 +52,76 @@ HINDSIGHT_SUBGOAL = "hindsight_subgoal"  # [] int64: the subgoal that an option 
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 TRAJ_IDS = ("collector", "traj_ids")
 PAD_MASK = ("collector", "mask")  # written by SliceSampler where it pads short trajectories
+
+
+@dataclass(frozen=True)
+class OptionKeys:
+    """Names of the entries that concern one set of subgoals: what is attained, and the book of options for them.
+
+    Every set but the farthest has a prefix of its own, so that books of several levels lie side by side.
+
+    Args:
+        prefix: put before each name; empty for the farthest set, which every hierarchical agent has.
+
+    Examples:
+        >>> OptionKeys().attained, OptionKeys("rooms").attained
+        ('attained', 'rooms_attained')
+    """
+
+    prefix: str = ""
+
+    def of(self, key: str) -> str:
+        """The name of an entry for this set of subgoals."""
+        return f"{self.prefix}_{key}" if self.prefix else key
+
+    @property
+    def attained(self) -> str:
+        return self.of(ATTAINED)
+
+    @property
+    def available(self) -> str:
+        return self.of(AVAILABLE)
+
+    @property
+    def subgoal(self) -> str:
+        return self.of(SUBGOAL)
+
+    @property
+    def subgoal_value(self) -> str:
+        return self.of(SUBGOAL_VALUE)
+
+    @property
+    def option_init(self) -> str:
+        return self.of(OPTION_INIT)
+
+    @property
+    def active_subgoal(self) -> str:
+        return self.of(ACTIVE_SUBGOAL)
+
+    @property
+    def subgoal_mask(self) -> str:
+        return self.of(SUBGOAL_MASK)
+
+    @property
+    def option_steps(self) -> str:
+        return self.of(OPTION_STEPS)
+
+    @property
+    def option_return(self) -> str:
+        return self.of(OPTION_RETURN)
+
+    @property
+    def subgoal_reached(self) -> str:
+        return self.of(SUBGOAL_REACHED)
+
+    @property
+    def option_done(self) -> str:
+        return self.of(OPTION_DONE)
+
+    @property
+    def option_terminated(self) -> str:
+        return self.of(OPTION_TERMINATED)
+
+    @property
+    def intrinsic_reward(self) -> str:
+        return self.of(INTRINSIC_REWARD)

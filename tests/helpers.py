@@ -20,14 +20,14 @@ from torchrl.collectors import Collector
 from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from hdrqn_torchrl.algorithms import Algorithm, make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3
-from hdrqn_torchrl.checkpoint import Checkpoints
-from hdrqn_torchrl.collectors import ResumableCollector
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.evaluation import evaluate
-from hdrqn_torchrl.learner import LearnerSettings
-from hdrqn_torchrl.logging import RunLogger
+from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
-from hdrqn_torchrl.trainer import Trainer
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.collectors import ResumableCollector
+from hdrqn_torchrl.runs.evaluation import evaluate
+from hdrqn_torchrl.runs.logging import RunLogger
+from hdrqn_torchrl.runs.trainer import Trainer
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 torch.set_num_threads(1)

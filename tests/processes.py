@@ -17,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parent.parent
 os.environ["RL_LOGGING_LEVEL"], os.environ["OMP_NUM_THREADS"] = "WARNING", "1"
 FORK = multiprocessing.get_context("forkserver")
-FORK.set_forkserver_preload(["helpers", "processes", "train", "hdrqn_torchrl.run_folder"])
+FORK.set_forkserver_preload(["helpers", "processes", "hdrqn_torchrl.cli.train", "hdrqn_torchrl.runs.folder"])
 
 
 def start(target, *arguments) -> BaseProcess:
@@ -113,8 +113,8 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
     from helpers import make_training, seed_everything
     from omegaconf import OmegaConf
 
-    import train
-    from resuming import Plan
+    from hdrqn_torchrl.cli import train
+    from hdrqn_torchrl.cli.resuming import Plan
 
     diary, orphans, began = Diary(folder / "diary.jsonl"), leftovers(folder), time.monotonic()
 

@@ -10,12 +10,12 @@ from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 from waits import HostWaits
 
-from hdrqn_torchrl import learner as learner_module
 from hdrqn_torchrl.envs import MontezumaEnv
-from hdrqn_torchrl.envs.grid_rules import GridState
-from hdrqn_torchrl.evaluation import evaluate
-from hdrqn_torchrl.legs import LegCounter
+from hdrqn_torchrl.envs.grid.rules import GridState
+from hdrqn_torchrl.learning import learner as learner_module
+from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network, paper_network
+from hdrqn_torchrl.runs.evaluation import evaluate
 from hdrqn_torchrl.transforms.window import resized
 
 EVERY = (*ALGORITHMS, "v3")

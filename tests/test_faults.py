@@ -15,8 +15,8 @@ from helpers import check_same, make_training, seed_everything, table
 from processes import Diary, leftovers, limited_file_size, start, train_with_diary
 from torchrl.checkpoint import CheckpointError
 
-from hdrqn_torchrl.checkpoint import verify
-from hdrqn_torchrl.finite import NonFiniteError
+from hdrqn_torchrl.learning.finite import NonFiniteError
+from hdrqn_torchrl.runs.checkpoint import verify
 
 INTERVAL = 32  # frames: every batch is saved
 

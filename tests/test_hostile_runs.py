@@ -10,23 +10,19 @@ import sys
 import time
 import zlib
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import pytest
 import torch
 import yaml
+from processes import ROOT
+from programs import TINY, TINY_HDRQN
 from safetensors.torch import load_file, save_file
-from test_train import TINY, TINY_HDRQN
 from torchrl.checkpoint import CheckpointError
 
-import evaluate
-import plot
-import report
-import train
-from configuration import RunError, SettingsError, check, read_config
-from resuming import Plan
+from hdrqn_torchrl.cli import evaluate, plot, report, train
+from hdrqn_torchrl.cli.configuration import RunError, SettingsError, check, read_config
+from hdrqn_torchrl.cli.resuming import Plan
 
-ROOT = Path(train.__file__).parent
 BIG = 200 << 30
 
 
@@ -87,7 +83,7 @@ def resumed(run):
 
 
 def plotted(run):
-    plot.main(plot.Settings(runs=str(run), out=str(run.parent / "figure.png")))
+    plot.run(plot.Settings(runs=str(run), out=str(run.parent / "figure.png")))
 
 
 def reported(run):
@@ -350,8 +346,8 @@ def test_what_is_in_the_way_of_a_training_is_told_or_replaced(run, name):
 def test_a_label_that_is_no_mathematics_is_drawn_as_it_stands(run):
     settings(env__layout="$\\frac{$")(run)
     with at_once(30):
-        plot.main(plot.Settings(runs=str(run), out=str(run.parent / "figure.png"), by="env.layout"))
-        plot.main(plot.Settings(runs=str(run), out=str(run.parent / "bars.png"), by="env.layout", kind="bars"))
+        plot.run(plot.Settings(runs=str(run), out=str(run.parent / "figure.png"), by="env.layout"))
+        plot.run(plot.Settings(runs=str(run), out=str(run.parent / "bars.png"), by="env.layout", kind="bars"))
 
 
 def test_folders_that_lead_round_are_walked_through_once(run):

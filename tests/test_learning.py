@@ -5,8 +5,8 @@ import torch
 from helpers import build, make_collector, small_env, tiny_settings
 
 from hdrqn_torchrl.algorithms import make_v3
-from hdrqn_torchrl.evaluation import evaluate
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
+from hdrqn_torchrl.runs.evaluation import evaluate
 
 TASK = {"num_obstacles": 0, "max_steps": 16, "view": 3}
 

@@ -14,11 +14,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
-from test_train import CONF
+from programs import CONF
 
-import train
-from configuration import RunError, SettingsError
-from resuming import Plan
+from hdrqn_torchrl.cli import train
+from hdrqn_torchrl.cli.configuration import RunError, SettingsError
+from hdrqn_torchrl.cli.resuming import Plan
 
 VALUES = (
     "0", "1", "2", "3", "-1", "7", "1000", "0.5", "1.5", "-0.5", "1e3", "inf", "nan", "null", "true", "abc", "''",
@@ -61,7 +61,7 @@ WORDS = {
     "meta_input_time": ("after_last_decision", "after_last_observation"), "obstacle": ("stay", "teleport"),
     "layout": ("open", "four_rooms"), "max_target": (1.0, 2.0), "priority_exponent": (0.9,), "view": (3, 5, 7, "null"),
     "max_option_steps": (1, 3), "refresh_hidden_steps": (7,), "max_steps": (4, 12), "num_envs": (1, 2, 5),
-    "phase_one": ("{_target_: hdrqn_torchrl.phases.PhaseOne, max_frames: 20}",), "slice_len": (1, 2, 3),
+    "phase_one": ("{_target_: hdrqn_torchrl.learning.PhaseOne, max_frames: 20}",), "slice_len": (1, 2, 3),
 }  # fmt: skip
 
 
@@ -163,14 +163,14 @@ def test_300_configurations_are_built_or_refused_in_words(first, tmp_path):
 
 @pytest.mark.parametrize("number", range(1, 101, 10))
 def test_ten_of_them_train(number, tmp_path, monkeypatch):
-    monkeypatch.setattr("hdrqn_torchrl.run_folder.plot_run", lambda _, path, **settings: path.touch())
+    monkeypatch.setattr("hdrqn_torchrl.analysis.plotting.plot_run", lambda _, path, **settings: path.touch())
     check_trains(number, tmp_path / "run")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(1_000, 2_000, 50))
 def test_many_train_or_are_refused_in_words(first, tmp_path, monkeypatch):
-    monkeypatch.setattr("hdrqn_torchrl.run_folder.plot_run", lambda _, path, **settings: path.touch())
+    monkeypatch.setattr("hdrqn_torchrl.analysis.plotting.plot_run", lambda _, path, **settings: path.touch())
     for number in range(first, first + 50):
         check_trains(number, tmp_path / str(number))
 

@@ -10,10 +10,10 @@ from functools import cache, partial
 import pytest
 from helpers import check_same, check_same_checkpoint, make_training, seed_everything, table
 
-from hdrqn_torchrl import checkpoint
-from hdrqn_torchrl.checkpoint import Checkpoints
-from hdrqn_torchrl.interruption import Interrupted
-from hdrqn_torchrl.phases import PhaseOne
+from hdrqn_torchrl.learning import PhaseOne
+from hdrqn_torchrl.runs import checkpoint
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.interruption import Interrupted
 
 BATCH = 32  # frames; see make_training
 TRAININGS = {

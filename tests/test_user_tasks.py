@@ -5,16 +5,14 @@ import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from test_train import TINY_HDRQN
+from processes import ROOT
+from programs import TINY_HDRQN
 
-import evaluate
-import plot
-from configuration import command_line
+from hdrqn_torchrl.cli import evaluate, plot
+from hdrqn_torchrl.cli.configuration import command_line
 
-ROOT = Path(evaluate.__file__).parent
 TRUSTED = "allowed_targets=[user_envs.Corridor]"
 TASK = [
     *("~env.layout", "~env.view", "~env.max_steps", "~env.obstacle", "env._target_=user_envs.Corridor", TRUSTED),

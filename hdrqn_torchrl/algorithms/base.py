@@ -16,10 +16,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.learning import Learner, LearnerSettings, Phases
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
-from hdrqn_torchrl.phases import Phases
 
 Controller = SubController | MetaController | AllSubgoalsPolicy
 

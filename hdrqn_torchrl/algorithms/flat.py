@@ -11,7 +11,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import StepSelector
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, SubController
 
 

@@ -24,9 +24,8 @@ from hdrqn_torchrl.data import (
     relabel_subgoals,
 )
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learner import Extract, Learner, LearnerSettings
+from hdrqn_torchrl.learning import Extract, Learner, LearnerSettings, PhaseOne, Phases
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
-from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform, largest_intrinsic_return
 
 LONGEST_HELD_EPISODE = 1_000

@@ -14,7 +14,7 @@ from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, largest_target, 
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learner import Learner, LearnerSettings
+from hdrqn_torchrl.learning import Learner, LearnerSettings, PhaseOne, Phases
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
     AllSubgoalsPolicy,
@@ -25,7 +25,6 @@ from hdrqn_torchrl.modules import (
 )
 from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
-from hdrqn_torchrl.phases import PhaseOne, Phases
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 V3_LEARNER = LearnerSettings(

@@ -1,9 +1,8 @@
 """Environments, the scripted players that mark their ceilings, and their Gymnasium twins."""
 
-from hdrqn_torchrl.envs.ceilings import ceiling
-from hdrqn_torchrl.envs.gridworld import MultiGoalGridEnv
-from hdrqn_torchrl.envs.montezuma import MontezumaEnv, make_montezuma
-from hdrqn_torchrl.envs.scripted import (
+from hdrqn_torchrl.envs.grid.ceilings import ceiling
+from hdrqn_torchrl.envs.grid.environment import MultiGoalGridEnv
+from hdrqn_torchrl.envs.grid.scripted import (
     EgocentricSearch,
     FullInformationPlanner,
     PerfectMemorySearch,
@@ -11,7 +10,8 @@ from hdrqn_torchrl.envs.scripted import (
     play_episodes,
     scripted_ceiling,
 )
-from hdrqn_torchrl.envs.task import GoalsInOrder, Task, task_of
+from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv, make_montezuma
+from hdrqn_torchrl.envs.task import GoalsInOrder, SubgoalSet, Task, task_of
 
 __all__ = [
     "EgocentricSearch",
@@ -20,6 +20,7 @@ __all__ = [
     "MontezumaEnv",
     "MultiGoalGridEnv",
     "PerfectMemorySearch",
+    "SubgoalSet",
     "Task",
     "UniformRandom",
     "ceiling",

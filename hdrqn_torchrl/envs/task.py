@@ -20,6 +20,43 @@ InOrder = Callable[[TensorDictBase], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
+class SubgoalSet:
+    """One set of subgoals of a task, and the prefix of the entries that an environment writes for it.
+
+    The environment writes ``attained`` ``[N, G]`` and, if not all of them are worth choosing at all times,
+    ``available`` ``[N, G]``, under the names of :class:`~hdrqn_torchrl.keys.OptionKeys`.
+
+    Args:
+        names: of its subgoals.
+        prefix: of its entries; empty for the farthest set.
+        repeatable: whether a subgoal can be attained more than once in an episode.
+
+    Raises:
+        ValueError: if there are no subgoals.
+
+    Examples:
+        >>> SubgoalSet(names=("north", "south"), prefix="rooms").keys.attained
+        'rooms_attained'
+    """
+
+    names: tuple[str, ...]
+    prefix: str = ""
+    repeatable: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.names:
+            raise ValueError("names must be those of at least one subgoal, got none; leave the set out.")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def keys(self) -> keys.OptionKeys:
+        """Names of its entries."""
+        return keys.OptionKeys(self.prefix)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """What an environment says about its task, in an attribute ``task``. What it leaves out is unknown.
 
@@ -32,6 +69,8 @@ class Task:
         smallest_extrinsic_return: smallest one; 0 where that reward is never negative.
         in_order: for tasks whose subgoals have an order: from what the environment wrote after a step ``[N]``, the
             share of all subgoals that the step reached in the proper order ``[N]``; ``None``: they have none.
+        subgoals: sets of subgoals, from near to far; an agent of L levels pursues the last L - 1 of them. None: it is
+            known only that there is one set, of as many as ``attained`` has.
 
     Raises:
         ValueError: if a number breaks its rule.
@@ -46,6 +85,7 @@ class Task:
     largest_extrinsic_return: float = math.inf
     smallest_extrinsic_return: float = -math.inf
     in_order: InOrder | None = None
+    subgoals: tuple[SubgoalSet, ...] = ()
 
     def __post_init__(self) -> None:
         if self.max_steps is not None and self.max_steps < 1:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hdrqn_torchrl.devices import autocast_dtype
-from hdrqn_torchrl.envs.cells import nearest_cell, palette
+from hdrqn_torchrl.envs.grid.cells import nearest_cell, palette
 from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
 _USUAL_VIEW = 5

@@ -15,9 +15,9 @@ from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.isolation import isolated
 from hdrqn_torchrl.modules import EpsilonGreedy
 from hdrqn_torchrl.rendering.scenes import Scene, scene_of
+from hdrqn_torchrl.runs.isolation import isolated
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from functools import cache
 from PIL import Image, ImageDraw
 from rich.text import Text
 
-from hdrqn_torchrl.envs.cells import AGENT_COLOUR, FIRST_GOAL, FLOOR, OBSTACLE, WALL, palette
-from hdrqn_torchrl.envs.grid_rules import GridRules, GridState
+from hdrqn_torchrl.envs.grid.cells import AGENT_COLOUR, FIRST_GOAL, FLOOR, OBSTACLE, WALL, palette
+from hdrqn_torchrl.envs.grid.rules import GridRules, GridState
 from hdrqn_torchrl.rendering.style import Colour, font
 
 _UNSEEN = (150, 150, 150)  # what lies outside the view fades into this

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 from rich.text import Text
 
 from hdrqn_torchrl.envs import MontezumaEnv
-from hdrqn_torchrl.envs.montezuma_screen import Box
+from hdrqn_torchrl.envs.montezuma.screen import Box
 from hdrqn_torchrl.rendering.style import Colour
 from hdrqn_torchrl.transforms.window import cut_out, resized
 

@@ -6,7 +6,7 @@ from torchrl.collectors import Collector
 from hdrqn_torchrl.algorithms import make_hdrqn
 from hdrqn_torchrl.data import OptionExtractor, OptionHistory
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.learner import LearnerSettings
+from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import compact_network
 
 ROOM = ("#####", "#   #", "#   #", "#   #", "#####")

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from hdrqn_torchrl.envs.cells import palette
+from hdrqn_torchrl.envs.grid.cells import palette
 from hdrqn_torchrl.modules import CellFeatures, CellsToImage, ConvFeatures, FullyConnectedFeatures
 
 

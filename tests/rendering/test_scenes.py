@@ -5,7 +5,7 @@ from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT, small_env
 from torchrl.envs import GymEnv
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.envs.cells import palette
+from hdrqn_torchrl.envs.grid.cells import palette
 from hdrqn_torchrl.rendering import scene_of
 
 CELL = 20  # pixels

@@ -1,0 +1,197 @@
+"""Which runs are compared: tasks by the settings of the environment, groups by any setting.
+
+Settings are plain nested dicts, as a run's ``config.yaml`` has them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hdrqn_torchrl.analysis.results import Run
+
+NONE = "none"
+"""Label of a setting that a run does not have."""
+_NOT_THE_TASK = {"num_envs", "seed", "device"}  # settings of the environment that leave the task as it is
+_MAY_DIFFER = {  # settings that do not make runs incomparable
+    "seed", "device", "threads", "logger", "log_frames", "evaluation", "checkpoint", "output_root", "resume",
+    "resume_override", "allowed_targets",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A run and what it was started with."""
+
+    run: Run
+    settings: dict[str, Any] = field(default_factory=dict)
+    choices: dict[str, str] = field(default_factory=dict)
+    """Which file of each group of conf/ the settings were composed of."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Groups of one task."""
+
+    title: str
+    groups: dict[str, list[Entry]]
+    """By label."""
+
+
+def rows_of(entries: Sequence[Entry], by: Sequence[str] = ("algo",), *, pool: bool = False) -> list[Row]:
+    """Sorts runs into tasks and groups.
+
+    Args:
+        entries: the runs.
+        by: what makes a group: a group of conf/ (``algo``, ``env``, ``network``), a setting (``algo.gamma``), or
+            ``run``. None: all runs are one group. Settings of the environment that are named here do not make a
+            task, so that their groups share a row.
+        pool: all tasks in one row.
+
+    Raises:
+        ValueError: if no run has what ``by`` names, or it is not a single setting.
+    """
+    labels = _labels(entries, by)
+    compared = {key.removeprefix("env.") for key in by if key.startswith("env.")}
+    tasks: dict[str, list[int]] = {}
+    for index, entry in enumerate(entries):
+        tasks.setdefault("" if pool or "env" in by else task_key(entry, compared), []).append(index)
+    titles = _titles([[entries[index] for index in members] for members in tasks.values()], compared)
+    rows = []
+    for title, members in zip(titles, tasks.values(), strict=True):
+        row = Row(title, {})
+        for index in sorted(members, key=lambda index: _natural(labels[index])):
+            row.groups.setdefault(labels[index], []).append(entries[index])
+        rows.append(row)
+    return sorted(rows, key=lambda row: _natural(row.title))
+
+
+def task_of(entry: Entry) -> dict[str, Any]:
+    """The settings of the environment that make a run's task."""
+    env = entry.settings.get("env") or {}
+    return {key: value for key, value in env.items() if key not in _NOT_THE_TASK}
+
+
+def task_key(entry: Entry, without: Set[str] = frozenset()) -> str:
+    """A text that is the same for runs of the same task, apart from the settings in ``without``."""
+    task = {key: value for key, value in task_of(entry).items() if key not in without}
+    return json.dumps(task, sort_keys=True, default=str)
+
+
+def value_of(entry: Entry, key: str) -> str:
+    """Value of a setting, or name of the chosen file of conf/, as text.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> entry = Entry(Run(Path("a"), {}), {"algo": {"sub": {"slice_len": 8}}}, {"algo": "v2"})
+        >>> [value_of(entry, key) for key in ("algo", "algo.sub.slice_len", "algo.nothing")]
+        ['v2', '8', 'none']
+    """
+    if key in entry.choices:
+        return _text(entry.choices[key])
+    value: Any = entry.settings
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    if not isinstance(value, dict):
+        return _text(value)
+    if "." not in key and "_target_" in value:
+        return _guessed_choice(key, value)
+    raise ValueError(f"by must name single settings, got {key!r}; name one below it: {', '.join(map(str, value))}.")
+
+
+def differences(entries: Sequence[Entry]) -> list[str]:
+    """Settings beside task and seed in which runs differ, outermost first."""
+    flat = []
+    for entry in entries:
+        settings = {key: value for key, value in entry.settings.items() if key not in _MAY_DIFFER}
+        env = entry.settings.get("env") or {}
+        settings["env"] = {key: env[key] for key in ("num_envs",) if key in env}
+        flat.append(dict(_flattened(settings)))
+    keys = dict.fromkeys(key for each in flat for key in each)
+    return sorted(
+        (key for key in keys if len({_text(each.get(key)) for each in flat}) > 1), key=lambda key: key.count(".")
+    )
+
+
+def _flattened(settings: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flattened(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _labels(entries: Sequence[Entry], by: Sequence[str]) -> list[str]:
+    """Label of each run's group: names of files of conf/ as they are, settings with the shortest name that tells."""
+    if not by:
+        return ["all"] * len(entries)
+    short = Counter(key.rpartition(".")[2] for key in by)
+    columns = []
+    for key in by:
+        values = _run_names(entries) if key == "run" else [value_of(entry, key) for entry in entries]
+        if set(values) == {NONE} and any(entry.settings for entry in entries):
+            raise ValueError(
+                f"by must name algo, env, network, run or a setting of the runs, got {key!r}, which none of them has; "
+                "config.yaml in a run folder shows its settings."
+            )
+        last = key.rpartition(".")[2]
+        name = last if short[last] == 1 else key
+        columns.append(values if _names_a_file(key, entries) else [f"{name}={value}" for value in values])
+    return [", ".join(parts) for parts in zip(*columns, strict=True)]
+
+
+def _run_names(entries: Sequence[Entry]) -> list[str]:
+    """Run folders, without what all of them have in common."""
+    parent = Path(os.path.commonpath([entry.run.folder.parent for entry in entries]))
+    return [str(entry.run.folder.relative_to(parent)) for entry in entries]
+
+
+def _names_a_file(key: str, entries: Sequence[Entry]) -> bool:
+    return "." not in key and all(isinstance(entry.settings.get(key, {}), dict) for entry in entries)
+
+
+def _titles(tasks: Sequence[Sequence[Entry]], without: Set[str]) -> list[str]:
+    """The environment's name, and the settings that tell tasks of the same name apart."""
+    names = [" + ".join(dict.fromkeys(value_of(entry, "env") for entry in entries)) for entries in tasks]
+    names = ["unknown task" if name == NONE else name for name in names]
+    titles = []
+    for name, (first, *_) in zip(names, tasks, strict=True):
+        same = [task_of(other) for (other, *_), its_name in zip(tasks, names, strict=True) if its_name == name]
+        keys = dict.fromkeys(key for task in same for key in task if key not in without)
+        telling = [key for key in keys if len({_text(task.get(key)) for task in same}) > 1]
+        titles.append(", ".join([name, *(f"{key}={_text(task_of(first).get(key))}" for key in telling)]))
+    return titles
+
+
+def _guessed_choice(group: str, settings: dict[str, Any]) -> str:
+    """What a part of the settings is called where a run folder does not say which file of conf/ it was."""
+    builder = str(settings["_target_"]).rpartition(".")[2]
+    if group == "env" and isinstance(layout := settings.get("layout"), str):
+        return {"open": "gridworld"}.get(layout, layout)
+    if group != "algo":
+        return builder.removesuffix("_network")
+    name = builder.removeprefix("make_")
+    if settings.get("recurrent") is False:
+        return {"drqn": "dqn", "hdrqn": "hdqn"}.get(name, name)
+    return _text(settings.get("version", name))
+
+
+def _text(value: Any) -> str:
+    """A setting as it stands in YAML."""
+    if value is None:
+        return NONE
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _natural(label: str) -> list[tuple[int, float, str]]:
+    """Sorts numbers in a text by their size."""
+    parts = re.split(r"(\d+(?:\.\d+)?)", label)
+    return [(1, float(part), "") if index % 2 else (0, 0.0, part) for index, part in enumerate(parts)]

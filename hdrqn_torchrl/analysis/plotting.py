@@ -1,0 +1,64 @@
+"""The curves of one run against the ceiling of its task."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from hdrqn_torchrl.analysis.results import Metrics, References, read_metrics
+
+__all__ = ["plot_run", "read_metrics"]
+
+_PANELS = (
+    ("return", "total reward of an episode"),
+    ("intrinsic", "intrinsic reward of an episode"),
+    ("extrinsic", "extrinsic reward of an episode"),
+    ("steps", "steps of an episode"),
+)
+
+
+def plot_run(
+    metrics: Metrics,
+    path: Path,
+    *,
+    title: str = "",
+    references: References | None = None,
+) -> None:
+    """Draws the paper's four curves (reward, intrinsic, extrinsic, steps) of one run over environment frames.
+
+    Args:
+        metrics: columns as :func:`~hdrqn_torchrl.analysis.results.read_metrics` returns them.
+        path: picture to write; its ending chooses the format.
+        title: heading.
+        references: scripted players by name, each with ``return_mean`` and ``steps_mean``, drawn as dashed lines.
+    """
+    figure = Figure(figsize=(4 * len(_PANELS), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(_PANELS))
+    for axis, (name, label) in zip(axes, _PANELS, strict=True):
+        for source, style in (("behaviour", {"alpha": 0.5}), ("greedy", {"marker": ".", "linewidth": 2})):
+            _curve(axis, metrics, f"{source}/{name}", source, style)
+        _reference_lines(axis, references or {}, f"{name}_mean")
+        axis.set(xlabel="environment frames", title=label)
+        axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axis.grid(alpha=0.3)
+    if axes[0].get_legend_handles_labels()[0]:
+        axes[0].legend(loc="lower right")
+    figure.suptitle(title.replace("$", r"\$"))  # it names what a run was composed of
+    figure.savefig(path, dpi=110)
+
+
+def _reference_lines(axis: Axes, references: References, name: str) -> None:
+    for place, (player, result) in enumerate(references.items()):
+        if name in result:
+            axis.axhline(result[name], linestyle="--", linewidth=1, color="grey")
+            at = (0.02 + 0.2 * place, result[name])  # side by side: two players may achieve the same
+            axis.annotate(player, at, xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
+
+
+def _curve(axis: Axes, metrics: Metrics, column: str, label: str, style: dict) -> None:
+    points = [(x, y) for x, y in zip(metrics.get("frames", []), metrics.get(column, []), strict=False) if y == y]
+    if points:
+        axis.plot(*zip(*points, strict=True), label=label, **style)

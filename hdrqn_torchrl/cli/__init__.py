@@ -1,0 +1,1 @@
+"""The programs: ``train``, ``evaluate``, ``watch``, ``plot``, ``report``. The only part that knows Hydra."""

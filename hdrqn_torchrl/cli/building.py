@@ -1,0 +1,234 @@
+"""From plain settings to built objects: :func:`build` checks and builds, in one step, the same data.
+
+Every ``_target_`` must stand on a list, in a place where such a thing belongs; every value must have the type that its
+builder asks for and, if it is a size, one that a machine can hold. Settings may come from somebody else's run folder.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from hydra.errors import InstantiationException
+from hydra.utils import get_object, instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from hdrqn_torchrl.cli.arguments import check_arguments
+from hdrqn_torchrl.runs.stored_settings import check_plain
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from hdrqn_torchrl.algorithms import Algorithm
+
+Settings = dict[str, Any]
+
+BUILDERS = {
+    "env": (
+        "hdrqn_torchrl.envs.MultiGoalGridEnv",
+        "hdrqn_torchrl.envs.make_montezuma",
+    ),
+    "algo": (
+        "hdrqn_torchrl.algorithms.make_dqn",
+        "hdrqn_torchrl.algorithms.make_drqn",
+        "hdrqn_torchrl.algorithms.make_hdqn",
+        "hdrqn_torchrl.algorithms.make_hdrqn",
+        "hdrqn_torchrl.algorithms.make_v3",
+    ),
+    "algo.*": (
+        "hdrqn_torchrl.learning.LearnerSettings",
+        "hdrqn_torchrl.modules.EpsilonGreedy",
+        "hdrqn_torchrl.modules.RepeatingEpsilonGreedy",
+        "hdrqn_torchrl.modules.SuccessEpsilonGreedy",
+        "hdrqn_torchrl.learning.PhaseOne",
+    ),
+    "network": (
+        "hdrqn_torchrl.modules.compact_network",
+        "hdrqn_torchrl.modules.paper_network",
+    ),
+    "logger.loggers[*]": (
+        "hdrqn_torchrl.runs.logging.make_tensorboard_logger",
+        "hdrqn_torchrl.runs.logging.make_wandb_logger",
+        "hdrqn_torchrl.runs.logging.make_mlflow_logger",
+    ),
+}
+"""What a ``_target_`` may name, by its place; one's own are added with ``allowed_targets=[package.builder]``."""
+
+ALLOWED_TARGETS = tuple(target for targets in BUILDERS.values() for target in targets)
+_LOGGER = re.compile(r"logger\.loggers\[\d+\]")
+_MARKS = {"_recursive_": (False,), "_convert_": ("all",)}  # Hydra's own, as the files of conf/ use them: for loggers
+
+LARGEST = {
+    "num_envs": 100_000,
+    "num_goals": 50,
+    "num_obstacles": 1_000,
+    "view": 501,
+    "size": 512,
+    "max_steps": 1_000_000,
+    "max_option_steps": 1_000_000,
+    "noops": 1_000_000,
+    "frame_skip": 1_000,
+    "threads": 1_024,
+    "hidden_size": 2_048,
+    "memory_size": 2_048,
+    "head_size": 2_048,
+    "widths": 2_048,
+    "prediction_steps": 64,
+    "refresh_hidden_steps": 10_000,
+    "slice_len": 100_000,
+    "batch_size": 100_000,
+    "capacity": 20_000_000,
+    "window": 100_000,
+}
+"""Sizes that something is made of; larger ones are mistakes, or mean to fill the memory of who looks at a run."""
+_LARGEST_NUMBER, _LONGEST_LIST = 10**18, 64  # of whole numbers of any other kind, and of lists of sizes
+
+
+class SettingsError(ValueError):
+    """A setting that breaks its rule, found before any work is done."""
+
+
+def build(settings: Any, *args: Any, place: str, allowed: Sequence[str] = ()) -> Any:
+    """Checks settings and builds from them.
+
+    Args:
+        settings: plain data with a ``_target_``; see :func:`plain`.
+        args: objects that the builder takes before its settings.
+        place: where the settings stand: ``"env"``, ``"algo"``, ``"network"``, ``"logger.loggers[0]"``.
+        allowed: builders allowed beside :data:`BUILDERS`; never read from the run folder itself.
+
+    Raises:
+        SettingsError: if something may not be built, or a value is of the wrong kind.
+        InstantiationException: if the builder refuses it; see :func:`explain`.
+    """
+    data = plain(settings)
+    check_all(data, place, allowed)
+    checked = OmegaConf.create({place: data}, flags={"allow_objects": True})
+    return instantiate(checked[place], *args)  # below its name, so that errors tell it
+
+
+def plain(settings: Any) -> Any:
+    """Settings as plain data: references of one's own command line are followed once; a copy."""
+    if OmegaConf.is_config(settings):
+        return OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+    return {key: plain(item) for key, item in settings.items()} if isinstance(settings, dict) else settings
+
+
+def build_env(config: DictConfig, changes: Mapping[str, Any], allowed: Sequence[str] = ()) -> EnvBase:
+    """The bare environment of a configuration, with some of its settings changed."""
+    return build(plain(config.env) | dict(changes), place="env", allowed=allowed)
+
+
+def build_algorithm(
+    config: DictConfig, changes: Mapping[str, Any] | None = None, allowed: Sequence[str] = ()
+) -> tuple[EnvBase, Algorithm]:
+    """The bare environment and the algorithm of a configuration.
+
+    Args:
+        config: the whole configuration.
+        changes: settings of the environment that are to differ.
+        allowed: see :func:`build`.
+    """
+    for place, part in _parts(plain(config)):  # all of them, before the first is built
+        check_all(part, place, allowed)
+    env = build_env(config, changes or {}, allowed)
+    network = build(config.network, place="network", allowed=allowed)
+    return env, build(config.algo, env, network, place="algo", allowed=allowed)
+
+
+def _parts(config: Settings) -> Iterator[tuple[str, Settings]]:
+    """All settings that something is built from, by their places."""
+    yield from ((name, config[name]) for name in ("env", "algo", "network"))
+    yield "env", {**config["env"], **config["evaluation"]["env"]}
+    yield from ((f"logger.loggers[{index}]", each) for index, each in enumerate(config["logger"]["loggers"]))
+
+
+def check_all(settings: Settings, place: str, allowed: Sequence[str]) -> None:
+    """Names, types and sizes, in this order: types are those of what is named, which is loaded for it.
+
+    Raises:
+        SettingsError: naming the setting.
+    """
+    if not isinstance(settings, dict) or "_target_" not in settings:
+        raise SettingsError(f"{place} must be settings with a _target_, got {settings!r}.")
+    check_targets(settings, allowed, place)
+    try:
+        check_arguments(settings, place, get_object)
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    check_sizes(settings, place)
+
+
+def check_targets(settings: Any, allowed: Sequence[str], place: str = "") -> None:
+    """Refuses every ``_target_`` that is not on the list for its place, and all that is not plain data.
+
+    Args:
+        settings: plain data that will be built.
+        allowed: names allowed beside :data:`BUILDERS`, in any place; never read from the run folder itself.
+        place: full name of ``settings``.
+    """
+    try:
+        check_plain(settings, place)
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    for path, node in _nodes(settings, place):
+        target = node.get("_target_")
+        if "_target_" in node and target not in (*_builders_at(path), *allowed):
+            raise SettingsError(
+                f"{path}._target_ must be one of the builders that this program trusts there, got {target!r}. If you "
+                f"wrote this setting and trust it, add 'allowed_targets=[{target}]' to the command."
+            )
+        for key in node:
+            of_hydra = target in allowed or (_LOGGER.fullmatch(path) and node[key] in _MARKS.get(key, ()))
+            if key.startswith("_") and key != "_target_" and not of_hydra:
+                raise SettingsError(f"{path}.{key} must be left out, got {node[key]!r}; name settings one by one.")
+
+
+def _nodes(settings: Any, path: str) -> Iterator[tuple[str, Settings]]:
+    """Every dict in settings, with its full name; what loggers only show is left out."""
+    if isinstance(settings, dict):
+        yield path, settings
+        shows = _LOGGER.fullmatch(path) and settings.get("_recursive_") is False
+        for key, item in settings.items():
+            if not (shows and key == "settings"):
+                yield from _nodes(item, f"{path}.{key}" if path else str(key))
+    elif isinstance(settings, list):
+        for index, item in enumerate(settings):
+            yield from _nodes(item, f"{path}[{index}]")
+
+
+def _builders_at(path: str) -> tuple[str, ...]:
+    parent, _, last = path.rpartition(".")
+    general = {f"{parent}.*", f"{parent}.{last.partition('[')[0]}[*]" if last.endswith("]") else path}
+    return tuple(target for place in general for target in BUILDERS.get(place, ()))
+
+
+def check_sizes(settings: Settings, place: str) -> None:
+    """Refuses sizes beyond all measure (:data:`LARGEST`).
+
+    Raises:
+        SettingsError: naming setting, rule and value.
+    """
+    for path, node in _nodes(settings, place):
+        for key, value in node.items():
+            values = value if isinstance(value, list) else [value]
+            largest = LARGEST.get(key, _LARGEST_NUMBER)
+            for each in values:
+                if isinstance(each, int) and abs(each) > largest:
+                    raise SettingsError(f"{path}.{key} must be <= {largest:,}, got {str(each)[:25]}; use less.")
+            if key in LARGEST and len(values) > _LONGEST_LIST:
+                raise SettingsError(f"{path}.{key} must have at most {_LONGEST_LIST} values, got {len(values)}.")
+
+
+def explain(error: Exception) -> str:
+    """The cause of a failed instantiation, with the full name of the setting in front."""
+    if not isinstance(error, InstantiationException):
+        return str(error)
+    path = str(error).rpartition("full_key: ")[2].strip() if "full_key: " in str(error) else ""
+    cause = error.__cause__
+    if isinstance(cause, (ImportError, OSError)):
+        return str(cause)
+    if isinstance(cause, ValueError):
+        return f"{path}.{cause}" if path else str(cause)
+    return f"{path}: {cause or error}; `python train.py --cfg job` shows every setting and its default."

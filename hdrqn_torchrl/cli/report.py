@@ -1,0 +1,368 @@
+"""Writes the results of the paper's studies: figures, tables and what agrees with its claims, from run folders.
+
+    python train.py -m experiment=gridworld sweep=parallel resume=auto output_root=outputs/studies
+    python report.py runs=outputs/studies out=docs/results.md
+
+runs      folders, glob patterns or archives (.tar.xz) that an earlier report kept, several in brackets; a run belongs
+          to a study if it has the settings of one of its jobs, wherever it lies
+out       text to write; its figures go to a folder of the same name. What stands in it outside of the
+          marked parts is left as it is
+size      small (default) or paper: which of a study's two sizes
+studies   only these: studies=gridworld,views; without it there is also an overview of all claims
+keep      archive (.tar.xz) to put the runs' settings and measurements into; weights are not kept
+
+The table of Montezuma's Revenge is made from what evaluate.py wrote into the run folders:
+python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_DIR/evaluations/greedy.json
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import re
+import tarfile
+import tempfile
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from omegaconf import MISSING
+from PIL import Image
+
+from hdrqn_torchrl.analysis.claims import Results
+from hdrqn_torchrl.analysis.comparison import plot_curves
+from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves, estimate_finals
+from hdrqn_torchrl.analysis.figures import plot_legs_over_time
+from hdrqn_torchrl.analysis.grouping import Entry, value_of
+from hdrqn_torchrl.analysis.results import final_value
+from hdrqn_torchrl.cli.configuration import SettingsError, command_line
+from hdrqn_torchrl.cli.plot import as_list, common_references, note, read_entries
+from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Job, Study, flat, is_run_of, jobs_of
+from hdrqn_torchrl.runs.files import RunFileError, read_json
+
+LARGEST_ARCHIVE = 256 << 20  # bytes, unpacked; a hundred times what all studies take
+KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json", "evaluations/*.json")
+SIZES = ("small", "paper")
+QUANTITIES = ("return", "success", "in_order", "steps")
+HEADER = (
+    "| | seeds | return | 95 % interval | IQM | share of the ceiling | in order | all in order | steps | frames "
+    "| wall time | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+)
+SCREEN_HEADER = (
+    "| | seed | trained frames | epsilon | sticky | score | 95 % interval | key | a door | steps | episodes "
+    "| commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+)
+CLAIMS = "| claim (of greedy play at the end) | | measured |\n|---|---|---|"
+_NAMES = [study.name for study in STUDIES]
+
+
+@dataclass
+class Settings:
+    """Arguments; the module's docstring explains them."""
+
+    runs: Any = MISSING
+    out: str = "docs/results.md"
+    size: str = "small"
+    studies: Any = None
+    keep: str | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """A run."""
+
+    entry: Entry
+    settings: dict[str, Any]
+    """As :func:`studies.flat` gives them."""
+    origin: dict[str, Any]
+    """``run.json``"""
+
+
+Runs = list[tuple[Job, Found]]
+"""Runs of a study and what each stands for in it; a run may stand for something in several studies."""
+
+
+def run(settings: Settings) -> None:
+    """Reads, matches, draws, writes."""
+    wanted = [str(name) for name in as_list(settings.studies, split=True)] or _NAMES
+    if settings.size not in SIZES:
+        raise SettingsError(f"size must be one of {', '.join(SIZES)}, got {settings.size!r}.")
+    if unknown := [name for name in wanted if name not in _NAMES]:
+        raise SettingsError(f"studies must be some of {', '.join(_NAMES)}, got {unknown[0]!r}.")
+    if Path(settings.out).suffix.lower() != ".md":
+        raise SettingsError(f"out must end in .md, got {settings.out!r}; for example out=docs/results.md.")
+    out = Path(settings.out)
+    out.with_suffix("").mkdir(parents=True, exist_ok=True)
+    text = out.read_text() if out.exists() else "# Results\n"
+    used: dict[Path, Found] = {}
+    overview = [CLAIMS.replace("|", "| study |", 1).replace("|---", "|---|---", 1)]
+    with ExitStack() as stack:
+        runs = read_runs([str(each) for each in as_list(settings.runs)], stack)
+        everywhere = runs_of_jobs("gridworld", settings.size, runs)[0]
+        for study in STUDIES:
+            if study.name in wanted and settings.size in study.sizes:
+                found, missing = runs_of_jobs(study.name, settings.size, runs)
+                used |= {run.entry.run.folder: run for _, run in found}
+                part, claims = section(study, found, missing, everywhere, settings)
+                text = put(text, f"{study.name} {settings.size}", part)
+                overview += [f"| {study.title} {line}" for line in claims]
+                print(f"{study.name}: runs {len(found)}, missing {missing}")
+        if not settings.studies:
+            text = put(text, f"claims {settings.size}", "\n".join(overview))
+        if settings.keep:
+            keep(list(used.values()), Path(settings.keep))
+    out.write_text(text)
+
+
+def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
+    """All runs below folders and in archives; archives are unpacked for as long as ``stack`` lasts."""
+    places = []
+    for pattern in patterns:
+        if pattern.endswith(".tar.xz"):
+            unpacked = stack.enter_context(tempfile.TemporaryDirectory())
+            try:
+                unpack(Path(pattern), Path(unpacked))
+            except (OSError, EOFError, ValueError, lzma.LZMAError, tarfile.TarError) as error:
+                raise SettingsError(f"runs must name folders or readable archives, got {pattern}: {error}.") from error
+            pattern = unpacked
+        places.append(pattern)
+    found = []
+    for entry in read_entries(places):
+        if entry.settings and (entry.run.folder / "run.json").exists():
+            try:
+                origin = read_json(entry.run.folder / "run.json")
+            except RunFileError as error:
+                note(f"warning: {entry.run.folder} is left out: {error}")
+                continue
+            found.append(Found(entry, flat(entry.settings), origin if isinstance(origin, dict) else {}))
+    return found
+
+
+class _Bounded:
+    """A compressed file that ends with an error when more comes out of it than any report keeps."""
+
+    def __init__(self, path: Path) -> None:
+        self._file, self._left = lzma.open(path), LARGEST_ARCHIVE  # noqa: SIM115  (it goes with this object)
+
+    def read(self, size: int) -> bytes:
+        """The next bytes."""
+        content = self._file.read(min(size, self._left + 1))
+        self._left -= len(content)
+        if self._left < 0:
+            raise ValueError(f"it holds more than {LARGEST_ARCHIVE:,} bytes")
+        return content
+
+
+def unpack(archive: Path, folder: Path) -> None:
+    """Takes the files that :func:`keep` puts into an archive out of it, and refuses one that holds anything else."""
+    with tarfile.open(fileobj=_Bounded(archive), mode="r|") as members:  # type: ignore[call-overload]
+        for member in members:
+            place = PurePosixPath(member.name)
+            if member.isdir() and not place.is_absolute() and ".." not in place.parts:
+                continue
+            kept = any(
+                place.match(f"*/{pattern}") and len(place.parts) == len(Path(pattern).parts) + 1 for pattern in KEPT
+            )
+            if not member.isreg() or not kept or place.is_absolute() or ".." in place.parts:
+                raise ValueError(f"{member.name} must be a file of a run, such as 000/metrics.csv")
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            content = members.extractfile(member)
+            assert content is not None
+            (folder / place).write_bytes(content.read())
+
+
+def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[Runs, int]:
+    """The run of each job of an experiment that has one, and the number of jobs that have none.
+
+    Of several runs of one job the finished one that went furthest counts.
+    """
+    found, missing = [], 0
+    for job in jobs_of(experiment if size == "small" else f"paper/{experiment}"):
+        same = [run for run in runs if is_run_of(job, run.settings)]
+        if same:
+            furthest = max(same, key=lambda run: (bool(run.entry.run.summary), run.entry.run.metrics["frames"][-1]))
+            found.append((job, furthest))
+        else:
+            missing += 1
+    return found, missing
+
+
+def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> tuple[str, list[str]]:
+    """Figure, table and claims of a study as Markdown, and the claims' lines; draws its figures."""
+    experiment = study.name if settings.size == "small" else f"paper/{study.name}"
+    lines = [f"`python train.py -m experiment={experiment}`"]
+    if left := missing + sum(not run.entry.run.summary for _, run in found):
+        lines[0] += f" (runs that have not been made to their end yet: {left} of {missing + len(found)})"
+    if not found:
+        return lines[0], []
+    beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]
+    tasks = rows_of_study(study, found, beside)
+    name = study.name if settings.size == "small" else f"{study.name}_paper"
+    lines += figures(study, Path(settings.out).with_suffix("") / name, tasks)
+    for title, groups in tasks:
+        lines += ["", f"**{title}**"] if len(tasks) > 1 else []
+        lines += ["", SCREEN_HEADER if study.on_screen else HEADER]
+        for label, members in groups.items():
+            lines += screen_rows(label, members) if study.on_screen else [table_row(label, members)]
+    verdicts = []
+    for claim in study.claims:
+        for title, groups in tasks:
+            if claim.row in (None, title) and (verdict := claim.check(finals(groups))):
+                row = f"{title}: " if claim.row else ""
+                verdicts.append(f"| {row}{verdict.claim} | {verdict.outcome} | {verdict.measured} |")
+    if verdicts:
+        lines += ["", CLAIMS, *verdicts]
+    return "\n".join(lines), verdicts
+
+
+def figures(study: Study, path: Path, tasks: list[tuple[str, dict[str, list[Found]]]]) -> list[str]:
+    """Draws a study; lines that show the pictures."""
+    lines = []
+    for drawing in study.drawings:
+        picture = path.with_name(f"{path.name}{drawing.ending}.png")
+        curves = [sum_up(row, groups, drawing) for row, groups in tasks]
+        plot_curves(curves, [picture], panels=drawing.panels, axis=drawing.axis)
+        lines += shown(picture, f"{study.title}: {drawing.shows}")
+    for _, groups in tasks if study.on_screen else []:
+        for label, members in groups.items():
+            first = min(members, key=lambda run: value_of(run.entry, "seed"))
+            if "legs/start_to_0" in first.entry.run.metrics:
+                picture = path.with_name(f"{path.name}_legs_{label}.png")
+                plot_legs_over_time(first.entry.run, first.settings["env.subgoals"], picture)
+                lines += shown(picture, f"{study.title}: options of {label} that reached their subgoal")
+    return lines
+
+
+def shown(picture: Path, title: str) -> list[str]:
+    """Lines that show a picture, which is made a third as large."""
+    with Image.open(picture) as image:
+        few_colours = image.convert("P", palette=Image.Palette.ADAPTIVE)
+    few_colours.save(picture, optimize=True)
+    return ["", f"![{title}]({picture.parent.name}/{picture.name})"]
+
+
+def rows_of_study(study: Study, found: Runs, beside: Runs) -> list[tuple[str, dict[str, list[Found]]]]:
+    """Titles of a study's rows and the runs of their groups, by label."""
+    rows: dict[str, dict[str, list[Found]]] = {}
+    for job, run in found:
+        row = rows.setdefault(job.label([study.rows]) if study.rows else study.title, {})
+        row.setdefault(job.label(study.by), []).append(run)
+    for row in rows.values():
+        for job, run in beside:
+            row.setdefault(job.overrides["algo"], []).append(run)
+    return list(rows.items())
+
+
+def sum_up(title: str, groups: dict[str, list[Found]], drawing: Drawing) -> TaskResults:
+    """Curves of the groups of a row."""
+    columns = [name for panel in drawing.panels for name in panel.columns]
+    summed = []
+    for label, members in groups.items():
+        entries = [each.entry for each in members]
+        runs = [entry.run for entry in entries]
+        estimates = estimate_curves(runs, columns, axis=drawing.axis)
+        summed.append(Group(label, runs, estimates, common_references(entries, "known")))
+    return TaskResults(title, summed)
+
+
+def finals(groups: dict[str, list[Found]]) -> Results:
+    """Final values of the finished runs by quantity and group."""
+    import numpy as np
+
+    results: dict[str, dict[str, Any]] = {}
+    for label, members in groups.items():
+        runs = [each.entry.run for each in members if each.entry.run.summary]
+        if runs:
+            for name in QUANTITIES:
+                values = np.array([final_value(run, f"greedy/{name}") for run in runs])
+                if np.isfinite(values).any():
+                    results.setdefault(name, {})[label] = values[np.isfinite(values)]
+    return results
+
+
+def table_row(label: str, members: list[Found]) -> str:
+    """Final results of a group as a line of a Markdown table."""
+    runs = [each.entry.run for each in members]
+    done = [run for run in runs if run.summary]
+    commits = commits_of(members)
+    seeds = ", ".join(sorted(value_of(each.entry, "seed") for each in members if each.entry.run.summary))
+    if not done:
+        return f"| {label} | none finished | | | | | | | | | | {commits} |"
+    columns = [f"greedy/{name}" for name in QUANTITIES]
+    mean = {name: each.value[0] for name, each in estimate_finals(done, columns).items()}
+    score = estimate_finals(done, columns[:1])[columns[0]]
+    trimmed = estimate_finals(done, columns[:1], center="iqm")[columns[0]].value[0]
+    iqm = f"{trimmed:.2f}" if len(done) >= 4 else ""  # of fewer it is the mean
+    interval = "" if score.low[0] != score.low[0] else f"{score.low[0]:.2f} to {score.high[0]:.2f}"
+    ceiling = done[0].summary.get("ceiling")
+    share = f"{mean[columns[0]] / ceiling:.0%}" if ceiling else ""
+    frames = sum(run.summary["frames"] for run in done) / len(done)
+    minutes = sum(run.summary["wall_seconds"] for run in done) / len(done) / 60
+    cells = (
+        label, seeds, f"{mean[columns[0]]:.2f}", interval, iqm, share, f"{mean[columns[2]]:.0%}",
+        f"{mean[columns[1]]:.0%}", f"{mean[columns[3]]:.1f}", f"{frames / 1000:.0f}k", f"{minutes:.0f} min", commits,
+    )  # fmt: skip
+    return "| " + " | ".join(cells) + " |"
+
+
+def commits_of(members: list[Found]) -> str:
+    """Where the runs' code stood."""
+    return ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
+
+
+def screen_rows(label: str, members: list[Found]) -> list[str]:
+    """What ``evaluations/*.json`` of a group's runs say, as lines of a Markdown table."""
+    rows = []
+    for member in members:
+        run = member.entry.run
+        results = [json.loads(path.read_text()) for path in (run.folder / "evaluations").glob("*.json")]
+        for result in sorted(results, key=lambda each: (each["env"]["sticky"], each["epsilon"])):
+            key = result["per_subgoal"][list(result["env"]["subgoals"]).index("key")]["attained"]
+            interval = result["intervals"]["return_mean"]
+            reach = f"{interval[0]:.0f} to {interval[1]:.0f}" if interval and interval[0] < interval[1] else ""
+            cells = (
+                *(label, value_of(member.entry, "seed"), f"{run.metrics['frames'][-1] / 1000:.0f}k"),
+                *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),
+                *(f"{result['return_mean']:.0f}", reach, f"{key:.0%}"),
+                *(f"{result['success_rate']:.0%}", f"{result['steps_mean']:.0f}", f"{result['episodes']}"),
+                commits_of([member]),
+            )
+            rows.append("| " + " | ".join(cells) + " |")
+    return rows
+
+
+def put(text: str, mark: str, part: str) -> str:
+    """Replaces what stands between a pair of marks, or adds both at the end.
+
+    Examples:
+        >>> put("before <!-- a -->\\nold\\n<!-- end of a --> after", "a", "new")
+        'before <!-- a -->\\nnew\\n<!-- end of a --> after'
+    """
+    begin, end = f"<!-- {mark} -->", f"<!-- end of {mark} -->"
+    marked = f"{begin}\n{part}\n{end}"
+    if begin not in text:
+        return f"{text.rstrip()}\n\n{marked}\n"
+    return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: marked, text, flags=re.DOTALL)
+
+
+def keep(runs: list[Found], archive: Path) -> None:
+    """Writes an archive that this program reads in place of the run folders; the same runs give the same bytes."""
+
+    def undated(member: tarfile.TarInfo) -> tarfile.TarInfo:
+        member.mtime, member.uid, member.gid, member.uname, member.gname = 0, 0, 0, "", ""
+        return member
+
+    archive.parent.mkdir(parents=True, exist_ok=True)
+    partial = archive.with_name(archive.name + ".partial")
+    with tarfile.open(partial, "w:xz") as file:
+        for number, run in enumerate(sorted(runs, key=lambda run: sorted(map(str, run.settings.items())))):
+            folder = run.entry.run.folder
+            for path in sorted(path for pattern in KEPT for path in folder.glob(pattern)):
+                file.add(path, f"{number:03d}/{path.relative_to(folder)}", filter=undated)
+    partial.replace(archive)
+
+
+def main() -> None:
+    """Runs with the arguments of the command line."""
+    command_line(Settings, __doc__, run)

@@ -1,0 +1,248 @@
+"""Where a training starts: anew in its own folder, or where an earlier one stopped."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Set
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from hdrqn_torchrl.cli.building import plain
+from hdrqn_torchrl.cli.configuration import SettingsError, check, read_choices, read_config
+
+FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets", "evaluation.ceilings")
+"""Settings that may differ when a run is resumed: they don't change what is learned."""
+FOLLOWS = "learning_rate_frames"
+"""Settings of this name that are equal to ``total_frames`` are raised with it."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What train.py is going to do."""
+
+    folder: Path
+    config: DictConfig
+    choices: dict[str, str]
+    resumed: bool
+    """Whether it goes on with a run that was begun before."""
+    checkpoint: Path | None = None
+    """Where it goes on; ``None``: at the run's newest checkpoint."""
+    weights: Path | None = None
+    """What it begins with instead of random weights."""
+
+
+def plan(config: DictConfig, folder: Path) -> Plan:
+    """Follows ``resume``.
+
+    Args:
+        config: settings as Hydra composed them, all references followed (:func:`configuration.resolved`).
+        folder: Hydra's new run folder.
+
+    Raises:
+        SettingsError: if a run would be overwritten, or resumed with other settings.
+    """
+    choices = dict(HydraConfig.get().runtime.choices)
+    if config.resume is None:
+        if holds_run(folder):
+            raise SettingsError(
+                f"{folder} already holds a run, which would be overwritten; `{command(folder, config)}` goes on "
+                "with it, any other hydra.run.dir starts a new one."
+            )
+        return Plan(folder, config, choices, resumed=False)
+    if config.resume == "auto":
+        run, checkpoint = find_same(config, folder), None
+        if run is None:
+            return Plan(folder, config, choices, resumed=False)
+    else:
+        run, checkpoint = split(Path(config.resume))
+        known = {f"sqlite:///{root}/mlflow.db" for root in (config.output_root, run.parent.parent)}
+        config = with_overrides(read_config(run), read_choices(run), config, HydraConfig.get().overrides.task)
+        check(config)
+        refuse_other_databases(config, known)
+    refuse_differences(run, config)
+    if checkpoint is not None and not config.resume_override:
+        refuse_going_back(checkpoint)
+    if run.resolve() != folder.resolve():
+        with contextlib.suppress(OSError):  # Hydra made it for this process; it is empty
+            folder.rmdir()
+            folder.parent.rmdir()
+    return Plan(run, config, read_choices(run) or choices, resumed=True, checkpoint=checkpoint)
+
+
+def command(folder: Path, config: DictConfig) -> str:
+    """What goes on with a run, as it is to be typed: quoted for the shell and for Hydra, with what one must trust."""
+    value = str(folder)
+    if re.fullmatch(r"[\w ./:-]+", value, re.ASCII) is None:
+        value = '"' + value.replace('"', '\\"') + '"'
+    words = [f"resume={value}"]
+    if targets := list(config.get("allowed_targets") or ()):
+        words.append(f"allowed_targets=[{','.join(map(str, targets))}]")
+    return shlex.join(["python", "train.py", *words])
+
+
+def holds_run(folder: Path) -> bool:
+    """Whether a training was begun in a folder."""
+    return (folder / "config.yaml").exists() or (folder / "checkpoints").exists()
+
+
+def split(path: Path) -> tuple[Path, Path | None]:
+    """``resume`` names a run folder or one of its checkpoints."""
+    if path.parent.name == "checkpoints":
+        return path.parent.parent, path
+    return path, None
+
+
+def find_same(config: DictConfig, folder: Path) -> Path | None:
+    """The run that the same command started before: in ``folder``, or else the newest below ``output_root``."""
+    if (folder / "config.yaml").exists():
+        return folder
+    if any(override.startswith(("hydra.run", "hydra.sweep")) for override in HydraConfig.get().overrides.hydra):
+        return None
+    runs = [path.parent for path in Path(config.output_root).glob("*/*/config.yaml")]
+    same = [run for run in runs if not _differences_or_broken(run, config)]
+    return max(same, key=lambda run: (run / "config.yaml").stat().st_mtime, default=None)
+
+
+def _differences_or_broken(run: Path, config: DictConfig) -> list[str]:
+    try:
+        return differences(read_config(run), config)
+    except SettingsError as error:
+        return [str(error)]
+
+
+def with_overrides(
+    stored: DictConfig, stored_choices: dict[str, str], given: DictConfig, overrides: list[str]
+) -> DictConfig:
+    """A run's settings with those changed that were given on the command line.
+
+    Args:
+        stored: the run's settings.
+        stored_choices: the run's choices of groups.
+        given: what the whole command line composes to.
+        overrides: the command line.
+    """
+    config = stored.copy()
+    for override in overrides:
+        key, _, value = override.lstrip("+~").partition("=")
+        if stored_choices.get(key) == value:
+            continue
+        if key in stored_choices and key not in config:
+            raise SettingsError(f"{override} can't be given with resume=FOLDER: settings come from that run.")
+        OmegaConf.update(config, key, OmegaConf.select(given, key), merge=False, force_add=True)
+    if config.total_frames > stored.total_frames:
+        for path in _following(plain(stored)):
+            OmegaConf.update(config, path, config.total_frames)
+    config.allowed_targets = given.allowed_targets  # never from the run folder
+    config.resume, config.resume_override = given.resume, given.resume_override
+    return config
+
+
+def _following(settings: dict[str, Any]) -> list[str]:
+    """Full names of the settings that end when the training does."""
+    total = settings["total_frames"]
+    return [key for key, value in _flat(settings["algo"], "algo").items() if key.endswith(FOLLOWS) and value == total]
+
+
+def refuse_differences(run: Path, config: DictConfig) -> None:
+    """Ends the program with a list of what changed since ``run`` began, unless ``resume_override`` is set."""
+    found = differences(read_config(run), config)
+    if found and not config.resume_override:
+        lines = "\n  ".join(found)
+        raise SettingsError(
+            f"settings must be those of the run that is resumed, and differ from {run}:\n  {lines}\n"
+            "Leave them out, or take the new ones with resume_override=true."
+        )
+
+
+def refuse_other_databases(config: DictConfig, known: Set[str]) -> None:
+    """Ends the program if a run folder names a database or server that the command does not: it would be written to.
+
+    Args:
+        config: settings of a run that was read back.
+        known: those that need no word.
+    """
+    for index, logger in enumerate(config.logger.loggers):
+        place = logger.get("tracking_uri")
+        if place is not None and place not in {*known, *config.allowed_targets}:
+            raise SettingsError(
+                f"logger.loggers[{index}].tracking_uri must be one of {', '.join(sorted(known))}, got {place!r}, which "
+                f"stands in the run folder. If it is yours, add 'allowed_targets=[{place}]' to the command."
+            )
+
+
+def refuse_going_back(checkpoint: Path) -> None:
+    """Ends the program if a run was saved later than ``checkpoint``: going on from there would undo that."""
+    if later := sorted(path.name for path in checkpoint.parent.glob("checkpoint-*") if path.name > checkpoint.name):
+        raise SettingsError(
+            f"resume must name a run's newest checkpoint, got {checkpoint}; {', '.join(later)} and the rows logged "
+            "since would be removed. Copy the run folder and resume the copy, or allow it with resume_override=true."
+        )
+
+
+def differences(stored: DictConfig, config: DictConfig) -> list[str]:
+    """Settings that changed, one line each. Raising ``total_frames`` is none, nor is what follows it."""
+    before, after = (_flat(_without_copies(plain(each))) for each in (stored, config))
+    frames = before.pop("total_frames"), after.pop("total_frames")
+    changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
+    for key in sorted(before.keys() | after.keys()):
+        old, new = before.get(key, "(not set)"), after.get(key, "(not set)")
+        follows = key.endswith(FOLLOWS) and (old, new) == frames
+        if old != new and not follows and not {key, key.partition(".")[0]} & set(FREE):
+            changed.append(f"{key}: {old} -> {new}")
+    return changed
+
+
+def _without_copies(settings: dict[str, Any]) -> dict[str, Any]:
+    """Leaves out what loggers are given to show: it stands elsewhere, too."""
+    loggers = (settings.get("logger") or {}).get("loggers")
+    for logger in loggers if isinstance(loggers, list) else []:
+        if isinstance(logger, dict):
+            logger.pop("settings", None)
+    return settings
+
+
+def _flat(node: Any, path: str = "") -> dict[str, Any]:
+    if not isinstance(node, dict) or not node:
+        return {path: node}
+    flat: dict[str, Any] = {}
+    for key, item in node.items():
+        flat |= _flat(item, f"{path}.{key}" if path else str(key))
+    return flat
+
+
+def record(run: Plan) -> None:
+    """Writes ``config.yaml`` and, at the beginning, ``run.json`` (where the run comes from)."""
+    from hdrqn_torchrl.runs.files import write_whole
+
+    if not (run.folder / "run.json").exists():
+        origin = {
+            "choices": run.choices,
+            "overrides": list(HydraConfig.get().overrides.task),
+            "command": " ".join(sys.argv),
+            "init_from": None if run.weights is None else str(run.weights),
+            "commit": _commit(),
+            "versions": {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")},
+        }
+        write_whole(run.folder / "run.json", json.dumps(origin, indent=2) + "\n")
+    write_whole(run.folder / "config.yaml", OmegaConf.to_yaml(run.config))
+
+
+def _commit() -> str | None:
+    """Commit of this program's files, if they are in a git repository."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    try:
+        return subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        ).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None

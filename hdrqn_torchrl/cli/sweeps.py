@@ -1,0 +1,218 @@
+"""Sweeps: a failed job does not end the others, what is unfinished is listed at the end, Ctrl-C reaches every worker.
+
+Hydra calls :class:`Sweep` around the jobs of ``python train.py -m ...`` (``hydra.callbacks`` in conf/config.yaml). They
+run in this process, or with ``sweep=parallel`` in worker processes that take one job after the other.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+POLL_SECONDS = 1.0
+PATIENCE_SECONDS = 120.0
+"""How long a job of a sweep waits for a process in its folder: one of a killed sweep has yet to save itself."""
+STARTED, DONE = "started", "done"
+Note = dict[str, Any]
+
+
+class JobStopped(RuntimeError):
+    """A job in a worker process was stopped on request. Unlike ``SystemExit`` this leaves the other workers alive."""
+
+
+class Sweep(Callback):
+    """Notes in ``jobs.jsonl`` of the sweep's folder when a job starts and how it ends."""
+
+    def __init__(self) -> None:
+        self.ledger: Path | None = None  # None: not a sweep
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        """In the main process, before all jobs."""
+        ledger = Path(config.hydra.sweep.dir) / "jobs.jsonl"
+        self.ledger = ledger.absolute()  # jobs may have other working directories
+        self.ledger.unlink(missing_ok=True)
+        atexit.register(report, ledger)  # Hydra leaves out on_multirun_end when a sweep ends with an exception
+        if not config.hydra.launcher._target_.endswith(".BasicLauncher"):
+            for number in SIGNALS:
+                signal.signal(number, _stop.pass_on)
+
+    def on_job_start(self, config: DictConfig, **_: Any) -> None:
+        """In the process of the job."""
+        if self.ledger is not None:
+            if in_worker():
+                _stop.watch_job()
+                os.environ["TTY_COMPATIBLE"] = "0"  # progress bars of several processes would overwrite each other
+            self._note(config, STARTED)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **_: Any) -> None:
+        """In the process of the job; left out if it was killed, or stopped in the main process."""
+        if self.ledger is None:
+            return
+        _stop.in_job = False  # before the note: an orphan has none to make
+        try:
+            with contextlib.redirect_stderr(io.StringIO()):  # a failed job's result prints its overrides and raises
+                _ = job_return.return_value
+        except Exception as error:
+            reason = one_line(error)
+            sys.stderr.write(f"job {config.hydra.job.num}: {reason}\n")
+            self._note(config, reason)
+            job_return.return_value = RuntimeError(reason)  # it can be pickled, whatever the error was
+            if config.hydra.sweeper._target_.endswith(".BasicSweeper"):
+                job_return.status = JobStatus.COMPLETED  # that sweeper would raise the first error and show no other
+        else:
+            self._note(config, DONE)
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        """In the main process, after all jobs."""
+        if _stop.number is not None:
+            sys.exit(128 + _stop.number)
+        if self.ledger is not None and unfinished(read_ledger(self.ledger)):
+            sys.exit(1)
+
+    def _note(self, config: DictConfig, state: str) -> None:
+        assert self.ledger is not None
+        if _stop.orphaned:
+            return  # the same command may have been given again: the book is that sweep's now
+        note = {
+            "job": config.hydra.job.num,
+            "folder": os.path.relpath(config.hydra.runtime.output_dir, config.hydra.runtime.cwd),
+            "overrides": list(config.hydra.overrides.task),
+            "state": state,
+        }
+        with self.ledger.open("a") as file:
+            file.write(json.dumps(note) + "\n")  # in one piece, as other processes write here, too
+
+
+def one_line(error: Exception) -> str:
+    """Kind and first line of an error.
+
+    Examples:
+        >>> one_line(KeyError("x"))
+        "KeyError: 'x'"
+    """
+    kind = "" if isinstance(error, JobStopped) else f"{type(error).__name__}: "
+    return kind + str(error).partition("\n")[0]
+
+
+def read_ledger(ledger: Path) -> list[Note]:
+    """The last note about each job that was started, in the order of the jobs."""
+    lines = ledger.read_text().splitlines() if ledger.exists() else []
+    last = {note["job"]: note for note in map(json.loads, lines)}
+    return [last[job] for job in sorted(last)]
+
+
+def unfinished(notes: list[Note]) -> list[Note]:
+    """Notes of the jobs that were not done."""
+    return [note for note in notes if note["state"] != DONE]
+
+
+def report(ledger: Path) -> None:
+    """Lists the unfinished jobs on stderr, each with the overrides that it does not share with all jobs, if any."""
+    notes = read_ledger(ledger)
+    shared = set.intersection(*(set(note["overrides"]) for note in notes)) if len(notes) > 1 else set()
+    if missing := unfinished(notes):
+        print(f"\nunfinished: {len(missing)} of {len(notes)} started jobs in {ledger.parent}", file=sys.stderr)
+    for note in missing:
+        own = " ".join(override for override in note["overrides"] if override not in shared)
+        reason = "stopped or killed" if note["state"] == STARTED else note["state"]
+        print(f"  {note['folder']} ({own})\n    {reason}", file=sys.stderr)
+
+
+class _Stop:
+    """A stop request by signal, in the main process of a parallel sweep or in a worker outside training.
+
+    In training, :class:`~hdrqn_torchrl.runs.interruption.StopRequest` takes the signals and the job saves itself.
+    """
+
+    def __init__(self) -> None:
+        self.number: int | None = None
+        self.in_job = False
+        self.orphaned = False
+        self._watching = False
+
+    def pass_on(self, number: int, _: FrameType | None) -> None:
+        """In the main process, which goes on waiting for its workers; a second signal ends all of them at once."""
+        self.number = number
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        print("stopping the jobs of the sweep; once more: without saving them", file=sys.stderr)
+        for worker in multiprocessing.active_children():
+            if worker.pid is not None:
+                os.kill(worker.pid, number)
+
+    def watch_job(self) -> None:
+        """In a worker, at the start of a job."""
+        for number in SIGNALS:
+            signal.signal(number, self._leave_job)
+        self.in_job = self.number is None
+        if not self._watching:
+            self._watching = True
+            threading.Thread(target=self._watch_parent, args=(os.getppid(),), daemon=True).start()
+
+    def _watch_parent(self, parent: int) -> None:
+        """Ends this worker when the sweep's main process is no more (kill -9), after its job has saved itself."""
+        while os.getppid() == parent:
+            time.sleep(POLL_SECONDS)
+        self.orphaned = True
+        os.kill(os.getpid(), signal.SIGTERM)
+        while self.in_job:
+            time.sleep(0.1)
+        os._exit(128 + signal.SIGTERM)
+
+    def _leave_job(self, number: int, _: FrameType | None) -> None:
+        """An idle worker only remembers: if one dies, joblib kills all others."""
+        from hdrqn_torchrl.runs.interruption import Interrupted
+
+        self.number = number
+        if self.in_job:
+            self.in_job = False
+            raise Interrupted(number)
+
+
+_stop = _Stop()
+
+
+def is_sweep() -> bool:
+    """Whether this process does jobs of ``train.py -m``."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def in_worker() -> bool:
+    """Whether this process belongs to a parallel launcher."""
+    return multiprocessing.parent_process() is not None
+
+
+def refuse_if_stopped() -> None:
+    """At the start of a job: raises :class:`JobStopped` if this worker was told to stop."""
+    if in_worker() and _stop.number is not None:
+        raise JobStopped("not started, as the sweep was stopped")
+
+
+def end_stopped_job(exit_code: int) -> NoReturn:
+    """At the end of a job that was stopped by a signal: ends the program, or in a worker this job and those to come.
+
+    Args:
+        exit_code: 130 or 143.
+    """
+    if not in_worker():
+        sys.exit(exit_code)
+    _stop.number, _stop.in_job = exit_code - 128, False
+    raise JobStopped(f"stopped by {signal.Signals(_stop.number).name}")

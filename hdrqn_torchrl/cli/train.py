@@ -1,0 +1,246 @@
+"""Trains one agent: ``python train.py env=gridworld algo=v2``. Any setting of conf/ can be overridden; -m sweeps."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import random
+import sys
+import traceback
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig, OmegaConf
+
+from hdrqn_torchrl.cli import sweeps
+from hdrqn_torchrl.cli.building import build, build_algorithm, build_env, explain, plain
+from hdrqn_torchrl.cli.configuration import CONF, RunError, SettingsError, check, pick_device, resolved
+from hdrqn_torchrl.cli.resuming import Plan, command, holds_run, plan, record
+from hdrqn_torchrl.runs.files import check_file, remove, replaced, write_whole
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from hdrqn_torchrl.runs.trainer import Trainer
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
+def main(config: DictConfig) -> float:
+    """Builds and trains; returns the final greedy return, so that a sweeper can maximise it.
+
+    Exit codes: 0 done; 1 failed, and a message says why; 130 and 143 stopped by SIGINT or SIGTERM: resume me.
+    """
+    folder, run = Path(HydraConfig.get().runtime.output_dir), None
+    os.chdir(HydraConfig.get().runtime.cwd)  # where paths were given: hydra.job.chdir=true would move below them
+    sweeps.refuse_if_stopped()
+    try:
+        config = resolved(config)
+        check(config)
+        run = plan(config, folder)
+        return train(run)
+    except KeyboardInterrupt as stop:
+        folder = folder if run is None else run.folder
+        print(f"{str(stop) or 'stopped'}; `{command(folder, config)}` goes on", file=sys.stderr)
+        sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
+    except Exception as error:
+        if run is None and not holds_run(folder):
+            note_error(folder)
+        if sweeps.is_sweep() or not isinstance(error, (SettingsError, RunError)):
+            raise
+        sys.exit(f"error: {error}")
+
+
+def train(run: Plan) -> float:
+    """One training run, from its beginning or from a checkpoint."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    # torch and torchrl take seconds to load; --help and --cfg do without them.
+    import torch
+    from torchrl.checkpoint import CheckpointError
+
+    from hdrqn_torchrl.runs.folder import locked
+
+    torch.set_num_threads(run.config.threads)
+    patience = sweeps.PATIENCE_SECONDS if sweeps.is_sweep() else 0.0
+    with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
+        refused = (InstantiationException, ValueError, CheckpointError) if run.resumed else ()
+        with noting_errors(run, unless=refused):
+            trainer, evaluation_env, references = begin(run)
+        with noting_errors(run):
+            trainer.train()
+            return write_summary(run, trainer, evaluation_env, references)["return_mean"]
+
+
+@contextlib.contextmanager
+def in_words(run: Plan) -> Iterator[None]:
+    """Turns what a user can get wrong, and what a machine can do wrong, into messages without a traceback."""
+    from torchrl.checkpoint import CheckpointError
+
+    from hdrqn_torchrl.learning.finite import NonFiniteError
+
+    try:
+        yield
+    except (InstantiationException, ValueError) as error:
+        raise SettingsError(explain(error)) from error
+    except (CheckpointError, NonFiniteError) as error:
+        raise RunError(str(error)) from error
+    except OSError as error:
+        remedy = f"mend that, then `{command(run.folder, run.config)}` goes on from the last checkpoint"
+        raise RunError(f"{error}; {remedy}.") from error
+
+
+def tell(sentence: str) -> None:
+    """Says on the terminal what takes long."""
+    print(sentence, file=sys.stderr, flush=True)
+
+
+def tell_of_player(sentence: str) -> None:
+    """The same for scripted players, which can be done without."""
+    tell(f"{sentence}; evaluation.ceilings=false leaves that out")
+
+
+@contextlib.contextmanager
+def noting_errors(run: Plan, *, unless: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """A training that fails leaves a traceback; one that can't be resumed with new settings has not failed."""
+    try:
+        yield
+    except Exception as error:
+        if not isinstance(error, unless):
+            note_error(run.folder)
+        raise
+
+
+def note_error(folder: Path) -> None:
+    """Writes the traceback of the error at hand to ``error.txt``."""
+    with contextlib.suppress(OSError):
+        write_whole(folder / "error.txt", traceback.format_exc())
+
+
+def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
+    """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
+    from hdrqn_torchrl.runs.checkpoint import Checkpoints
+    from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
+
+    for name in ("config.yaml", "run.json", "metrics.csv", "error.txt", "summary.json", "curves.png"):
+        check_file(run.folder / name)
+    checkpoints = Checkpoints(run.folder / "checkpoints")
+    checkpoints.clean_up()  # first: it may bring back the newest
+    start = run.checkpoint or (checkpoints.newest() if run.resumed else None)
+    stale = [*run.folder.glob("*.partial*"), *([run.folder / "metrics.csv"] if start is None else [])]
+    for path in stale:
+        remove(path)
+    trainer, evaluation_env, references = build_run(run)
+    if start is not None:
+        trainer.resume(start)
+    elif run.config.init_from is not None:
+        path = find_weights(Path(run.config.init_from), run.config.init_checkpoint)
+        start_from(trainer.algorithm, load_weights_of(path))
+        trainer.collector.update_policy_weights_()
+        run = replace(run, weights=path)
+    record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
+    for name in ("error.txt", "summary.json", "curves.png"):
+        remove(run.folder / name)
+    return trainer, evaluation_env, references
+
+
+def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, references: dict) -> dict[str, Any]:
+    """Final greedy evaluation; writes and prints the run's results."""
+    from hdrqn_torchrl.analysis.plotting import plot_run
+    from hdrqn_torchrl.analysis.results import read_metrics
+    from hdrqn_torchrl.runs import folder
+    from hdrqn_torchrl.runs.evaluation import evaluate
+
+    if references:  # the others come last: training need not wait for them
+        references = folder.references_for(evaluation_env.base_env, tell=tell_of_player)
+    result = evaluate(
+        evaluation_env,
+        trainer.algorithm.policy,
+        episodes=run.config.evaluation.final_episodes,
+        seed=run.config.evaluation.seed + 1,
+        max_steps=run.config.evaluation.max_steps,
+    )
+    groups = (f"{name}={run.choices[name]}" for name in ("env", "algo", "network") if name in run.choices)
+    title = " ".join([*groups, f"seed={run.config.seed}"])
+    summary = folder.write_summary(run.folder, trainer, result, references=references)
+    with replaced(run.folder / "curves.png") as picture:
+        plot_run(read_metrics(run.folder / "metrics.csv"), picture, title=title, references=references)
+    print(json.dumps({"run": str(run.folder), **summary}))
+    return summary
+
+
+def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
+    """Everything that a run needs: trainer, evaluation environment, scripted references."""
+    import numpy
+    import torch
+
+    from hdrqn_torchrl.envs.specs import interface_differences
+    from hdrqn_torchrl.runs.checkpoint import Checkpoints
+    from hdrqn_torchrl.runs.collectors import ResumableCollector
+    from hdrqn_torchrl.runs.evaluation import evaluate
+    from hdrqn_torchrl.runs.folder import ceiling_of, references_for
+    from hdrqn_torchrl.runs.logging import RunLogger
+    from hdrqn_torchrl.runs.trainer import Trainer
+
+    config = run.config
+    device = pick_device(config.device, torch.cuda.is_available())
+    random.seed(config.seed)
+    numpy.random.seed(config.seed)
+    torch.manual_seed(config.seed)
+    allowed = config.allowed_targets
+    env, algorithm = build_algorithm(config, {"seed": config.seed, "device": device}, allowed)
+    played = {"num_envs": config.evaluation.num_envs, "device": device, **plain(config.evaluation.env)}
+    evaluation_base = build_env(config, played, allowed)
+    if found := interface_differences(env, evaluation_base):
+        raise ValueError(
+            f"evaluation.env must leave what the agent sees and does as it is in training, got "
+            f"{OmegaConf.to_container(config.evaluation.env)}: {found}; set env.KEY for both."
+        )
+    evaluation_env = algorithm.transform(evaluation_base)
+    references = (
+        references_for(evaluation_env.base_env, ["memory"], tell=tell_of_player) if config.evaluation.ceilings else {}
+    )
+    frames_per_batch = env.batch_size[0] * config.steps_per_batch
+    collector = ResumableCollector(
+        algorithm.transform(env),
+        algorithm.policy,
+        frames_per_batch=frames_per_batch,
+        total_frames=-(-config.total_frames // frames_per_batch) * frames_per_batch,
+        device=device,
+        auto_register_policy_transforms=False,
+    )
+    trainer = Trainer(
+        algorithm,
+        collector,
+        logger=RunLogger(
+            run.folder,
+            total_frames=config.total_frames,
+            loggers=[
+                build(logger, run.folder, place=f"logger.loggers[{index}]", allowed=allowed)
+                for index, logger in enumerate(config.logger.loggers)
+            ],
+            label=run.folder.name if sweeps.is_sweep() else "",
+        ),
+        evaluate=lambda: evaluate(
+            evaluation_env,
+            algorithm.policy,
+            episodes=config.evaluation.episodes,
+            seed=config.evaluation.seed,
+            max_steps=config.evaluation.max_steps,
+        ),
+        total_frames=config.total_frames,
+        log_frames=config.log_frames,
+        evaluation_frames=config.evaluation.interval_frames,
+        checkpoints=Checkpoints(
+            run.folder / "checkpoints", keep_last=config.checkpoint.keep_last, replay=config.checkpoint.replay
+        ),
+        checkpoint_frames=config.checkpoint.interval_frames,
+        checkpoint_seconds=60.0 * config.checkpoint.interval_minutes,
+        ceiling=ceiling_of(references),
+    )
+    return trainer, evaluation_env, references

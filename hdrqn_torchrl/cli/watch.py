@@ -1,0 +1,111 @@
+"""Records episodes of a trained agent: the world, what the agent sees, wants and does, and both levels' Q-values.
+
+    python watch.py run=RUN_DIR out=episode.gif
+    python watch.py run=RUN_DIR out=terminal env.layout=four_rooms epsilon=0.1
+
+run              folder that train.py wrote
+out              what to write, by ending: .gif or .mp4 (needs PyAV), or terminal to watch at once (default episode.gif)
+episodes         how many, one after the other (default 3)
+seed             of worlds and exploration; the same seed shows the same episodes (default 0)
+checkpoint       best (default), last, or the path of a checkpoint or weights file
+epsilon          probability of a random choice, at both levels (default 0: greedy)
+fps              steps a second (default 4)
+env.KEY          a setting of the task that shall differ from the run's: env.view, env.obstacle, env.max_steps, ...
+allowed_targets  builders of your own that the run may name: [package.builder]
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import MISSING
+
+from hdrqn_torchrl.cli.configuration import SettingsError, check_place, command_line, load_agent
+
+if TYPE_CHECKING:
+    from hdrqn_torchrl.rendering import Frame
+
+
+@dataclass
+class Settings:
+    """Arguments; the module's docstring explains them."""
+
+    run: str = MISSING
+    out: str = "episode.gif"
+    episodes: int = 3
+    seed: int = 0
+    checkpoint: str = "best"
+    epsilon: float = 0.0
+    fps: int = 4
+    env: dict[str, Any] = field(default_factory=dict)
+    allowed_targets: list[str] = field(default_factory=list)
+
+
+def run(settings: Settings) -> None:
+    """Plays, then shows or writes what was played."""
+    path = None if settings.out == "terminal" else Path(settings.out)
+    if path is not None:
+        check_place(path, "out")
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    # torch and torchrl take seconds to load; --help does without them.
+    import torch
+
+    from hdrqn_torchrl.rendering import check_video, play_in_terminal
+
+    torch.set_num_threads(1)
+    try:
+        check_video(path, fps=settings.fps)
+        frames = record(settings)
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    if path is not None:
+        write(frames, path, settings.fps)
+        return
+    with suppress(KeyboardInterrupt):  # seen enough
+        play_in_terminal(frames, fps=settings.fps)
+
+
+def record(settings: Settings) -> list[Frame]:
+    """What the run's agent does."""
+    from hdrqn_torchrl.rendering import record_episodes
+
+    agent = load_agent(
+        settings.run,
+        checkpoint=settings.checkpoint,
+        env_changes=settings.env,
+        allowed_targets=settings.allowed_targets,
+    )
+    return record_episodes(
+        agent.env, agent.algorithm, episodes=settings.episodes, seed=settings.seed, epsilon=settings.epsilon
+    )
+
+
+def write(frames: list[Frame], path: Path, fps: int) -> None:
+    """Writes the file under another name first, so that it is whole or not there; prints how the episodes ended."""
+    from hdrqn_torchrl.rendering import write_video
+
+    partial = _partial(path)
+    try:
+        write_video(frames, partial, fps=fps)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    for frame in frames:
+        if frame.outcome:
+            score = frame.score
+            print(f"episode {frame.episode}: {frame.outcome}, return {score.total:.2f}, {score.steps} steps")
+    print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f".{path.name}.partial{path.suffix}")
+
+
+def main() -> None:
+    """Runs with the arguments of the command line."""
+    command_line(Settings, __doc__ or "", run)

@@ -1,0 +1,97 @@
+"""Keeps NaN and infinity out of the weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+
+class NonFiniteError(ArithmeticError):
+    """A number that training depends on became NaN or infinite."""
+
+
+class FiniteGuard:
+    """Looks at the loss and the gradients of every update before the optimiser does.
+
+    On a CPU it looks at once. On a GPU the host would have to wait for every update; there the optimiser itself skips
+    the step and all that follow (``found_inf`` of fused Adam, which never leaves the device), what happened first is
+    kept on the device, and :meth:`check` looks at it when asked.
+
+    Args:
+        at_once: whether to look at every update.
+
+    Examples:
+        >>> guard, nan = FiniteGuard(at_once=False), torch.tensor(float("nan"))
+        >>> guard.watch(torch.tensor(2.0), {"weight": nan}, nan, "update 7")
+        tensor(1.)
+        >>> guard.check()
+        Traceback (most recent call last):
+        hdrqn_torchrl.learning.finite.NonFiniteError: the gradient of weight became NaN or infinite in update 7
+    """
+
+    def __init__(self, *, at_once: bool) -> None:
+        self.at_once = at_once
+        self._found: Tensor | None = None  # 1.0 from the first such update on
+        self._first: Tensor | None = None  # its loss, its largest gradients, and its place in _places
+        self._names: list[str] = []
+        self._places: list[str] = []
+
+    def watch(self, loss: Tensor, gradients: Mapping[str, Tensor], norm: Tensor, place: str) -> Tensor | None:
+        """Takes one update.
+
+        Args:
+            loss: ``[]``.
+            gradients: by the name of their parameter.
+            norm: of all gradients together, ``[]``.
+            place: which update it is, for the message.
+
+        Returns:
+            What the optimiser needs to know, ``[]``: 1 if it must skip the step; ``None`` if it need not ask.
+
+        Raises:
+            NonFiniteError: if it looks at once and something is not finite.
+        """
+        loss = loss.detach()
+        sound = torch.isfinite(loss + norm)
+        if not self.at_once:
+            return self._remember(sound, loss, gradients, place)
+        if not sound:
+            raise NonFiniteError(self._explain(loss, _largest(gradients), list(gradients), place))
+        return None
+
+    def _remember(self, sound: Tensor, loss: Tensor, gradients: Mapping[str, Tensor], place: str) -> Tensor:
+        state = torch.stack([loss, *_largest(gradients), torch.full_like(loss, len(self._places))])
+        self._names = list(gradients)
+        self._places.append(place)
+        if self._found is None or self._first is None:
+            self._found, self._first = torch.zeros_like(loss), state
+        self._first = torch.where(self._found > 0, self._first, state)
+        self._found = torch.maximum(self._found, (~sound).to(loss.dtype))
+        return self._found
+
+    def check(self) -> None:
+        """Looks at all updates since the last check.
+
+        Raises:
+            NonFiniteError: naming what was not finite, and the first update in which it was not.
+        """
+        if self._found is not None and self._first is not None and self._found > 0:
+            loss, *largest, place = self._first.unbind()
+            raise NonFiniteError(self._explain(loss, largest, self._names, self._places[int(place)]))
+        self._places = []
+
+    @staticmethod
+    def _explain(loss: Tensor, largest: Sequence[Tensor], names: Sequence[str], place: str) -> str:
+        if not torch.isfinite(loss):
+            return f"the loss became {loss.item()} in {place}"
+        for name, value in zip(names, largest, strict=True):
+            if not torch.isfinite(value):
+                return f"the gradient of {name} became NaN or infinite in {place}"
+        return f"the gradient's norm became infinite in {place}"
+
+
+def _largest(gradients: Mapping[str, Tensor]) -> Sequence[Tensor]:
+    """Largest absolute value of each; NaN where there is one."""
+    return torch._foreach_norm(list(gradients.values()), torch.inf)

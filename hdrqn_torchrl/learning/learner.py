@@ -1,0 +1,371 @@
+"""One level of the agent as a learner: its replay memory, loss, optimiser and target network (Algorithms 3 and 4)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torch.nn import Parameter
+from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+
+from hdrqn_torchrl.data import FROM_STARTS, Continuity, LongerEpisodes, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.learning.finite import FiniteGuard
+from hdrqn_torchrl.learning.precision import choose_precision, matrix_products
+from hdrqn_torchrl.learning.settings import LearnerSettings
+
+
+class Extract(Protocol):
+    """Turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet."""
+
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase | None: ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """What it carries from batch to batch."""
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+
+
+class Learner:
+    """Stores what was collected, samples sequences, and updates one network from them.
+
+    Args:
+        network: the controller that is trained; the policy acts with the same parameters.
+        settings: how it learns.
+        extract: turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet; with
+            ``state_dict`` and ``load_state_dict``.
+        loss: reads a minibatch ``[batch_size, slice_len + lookahead]``, with the steps of its attribute ``lookahead``
+            that it does not train (none if it has no such attribute); writes ``"loss"``, which is minimised, and
+            scalars to report.
+        num_envs: N if ``extract`` returns steps ``[N, T]``; ``None`` if rows ``[M]``.
+        episode_len: largest number of transitions of an episode, if known (see
+            :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
+        refresh: applied to every minibatch before it is learned from.
+        separate: parts of the network, by how the names of their parameters begin, that are optimised apart: with
+            this share of the learning rate, and with gradients clipped by their own norm.
+        samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
+            and one large draw costs little more than a small one. Priorities are those of
+            the draw: up to ``samples_per_draw - 1`` updates old.
+
+    Examples:
+        See :func:`hdrqn_torchrl.algorithms.make_drqn`, which builds one.
+    """
+
+    def __init__(
+        self,
+        network: TensorDictModuleBase,
+        settings: LearnerSettings,
+        *,
+        extract: Extract,
+        loss: LossModule,
+        num_envs: int | None = None,
+        episode_len: int | None = None,
+        refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        separate: Mapping[str, float] | None = None,
+        samples_per_draw: int = 8,
+    ) -> None:
+        self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
+        self.loss = loss
+        if settings.priority_exponent is not None and "priority" not in loss.out_keys:
+            raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
+        self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
+        self._parameters = dict(network.named_parameters())
+        self.device = next(iter(self._parameters.values())).device
+        self.precision = choose_precision(settings.precision, network)
+        self.guard = FiniteGuard(at_once=self.device.type == "cpu")
+        self.updates, self.frames = 0, 0
+        groups = _group(self._parameters, separate or {})
+        self._rates = [rate for rate, _ in groups]
+        self.optimizer = torch.optim.Adam(
+            [{"params": parameters} for _, parameters in groups], lr=settings.learning_rate, fused=True
+        )
+        self._set_learning_rate()
+        if settings.slice_len is None:
+            raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
+        lookahead = getattr(loss, "lookahead", 0)
+        self._sequence_len = settings.slice_len + lookahead
+        from_starts = settings.sampling in FROM_STARTS and (episode_len is None or episode_len > settings.slice_len)
+        self._longer = LongerEpisodes(settings.slice_len) if from_starts else None
+        self.buffer = make_sequence_buffer(
+            settings.capacity,
+            slice_len=settings.slice_len,
+            lookahead=lookahead,
+            batch_size=settings.batch_size * samples_per_draw,
+            num_envs=num_envs,
+            episode_len=episode_len,
+            sampling=settings.sampling,
+            priority_exponent=settings.priority_exponent,
+            importance_exponent=settings.importance_exponent,
+            device=self.device,
+        )
+        self._continuity = Continuity()
+        self._drawn: list[TensorDictBase] = []
+        self.held = False
+        """Whether it stores only; what it could have learned meanwhile is not made up for."""
+        self._warm_at = settings.warmup_frames  # or when a sequence could be drawn, if that was later
+        self._has_warned = False
+
+    @property
+    def learning_rate(self) -> float:
+        """Adam's rate at the frames seen so far."""
+        start, end = self.settings.learning_rate, self.settings.learning_rate_end
+        progress = min(1.0, self.frames / self.settings.learning_rate_frames)
+        return start if end is None else start + (end - start) * progress
+
+    def _set_learning_rate(self) -> None:
+        for share, group in zip(self._rates, self.optimizer.param_groups, strict=True):
+            group["lr"] = share * self.learning_rate
+
+    def store(self, batch: TensorDictBase) -> None:
+        """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``.
+
+        Raises:
+            ValueError: if the batch is not of the environments that the memory was built for, or does not go on where
+                the last one ended (:class:`~hdrqn_torchrl.data.Continuity`).
+            NonFiniteError: as :meth:`check_finite`.
+        """
+        self.check_finite()
+        if batch.device != self.device:  # a collector that was told no device numbers its episodes on the host
+            batch = batch.to(self.device)
+        self._continuity.check(batch)
+        self.frames += batch.numel()
+        self._drawn = []
+        self._set_learning_rate()
+        try:
+            transitions = self.extract(batch)
+        except KeyError as error:
+            raise ValueError(
+                f"batch must hold all that environment and policy wrote, got one without an entry ({error.args[0]}); "
+                "collect without compact_obs=True, and leave nothing out."
+            ) from error
+        if transitions is not None:
+            self.buffer.extend(transitions)
+            self._warn_of_longer_episodes(transitions)
+        if self._frames_owed > 0 and (self.held or not self._can_draw()):
+            self._warm_at += math.ceil(self._frames_owed)
+
+    def _warn_of_longer_episodes(self, transitions: TensorDictBase) -> None:
+        """Says once that an episode has transitions that no sequence from its start will ever show."""
+        if self._longer is not None and self._longer.seen(transitions):
+            self._longer = None
+            warnings.warn(
+                f"slice_len should cover an episode with sampling={self.settings.sampling!r}, got "
+                f"{self.settings.slice_len} where one has more transitions; the later ones are never learned from: "
+                "raise slice_len, or use sampling='steps' with stored_state=True.",
+                stacklevel=3,
+            )
+
+    @property
+    def _frames_owed(self) -> float:
+        """Frames since the warm-up for which no updates were made."""
+        return self.frames - self._warm_at - self.updates * self.settings.frames_per_update
+
+    def _can_draw(self) -> bool:
+        """Whether the memory holds a sequence; warns once where it is full of others."""
+        if self.buffer.can_sample():
+            return True
+        if self.buffer.is_full() and not self._has_warned:
+            self._has_warned = True
+            warnings.warn(
+                f"capacity should be so large that a sequence of {self._sequence_len} transitions that begins where an "
+                f"episode does is always stored, got {self.settings.capacity}; nothing is learned while there is none: "
+                "raise it, use a smaller slice_len, or stored_state=True with sampling='steps'.",
+                stacklevel=3,
+            )
+        return False
+
+    def updates_due(self) -> int:
+        """How many updates are owed for the frames seen so far; none while no sequence can be drawn."""
+        owed = int((self.frames - self._warm_at) / self.settings.frames_per_update) - self.updates
+        return owed if owed > 0 and self._can_draw() else 0
+
+    def sample(self) -> TensorDictBase:
+        """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
+        if not self._drawn:
+            sequences = sample_sequences(self.buffer, self._sequence_len)
+            self._drawn = list(sequences.split(self.settings.batch_size, 0))
+        sample = self._drawn.pop()
+        return sample if self.refresh is None else self.refresh(sample)
+
+    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+        """One gradient step on ``sample`` and one soft update of the target network.
+
+        Returns:
+            Scalars without gradient: ``loss``, ``td_error``, ``q_value``, ``target``, ``trained_steps`` and, if
+            gradients are clipped, ``grad_norm``.
+
+        Raises:
+            NonFiniteError: if loss or gradient is; the weights are as they were. On a GPU they are left alone, too, and
+                :meth:`check_finite` raises it.
+        """
+        with matrix_products(self.precision, self.device.type):
+            metrics = dict(self.loss(sample).items())
+        priority = metrics.pop("priority", None)
+        self.optimizer.zero_grad()
+        metrics["loss"].backward()
+        norm = self._watch_gradients(metrics["loss"])
+        if self.settings.max_grad_norm is not None:
+            self._clip_gradients(self.settings.max_grad_norm, norm)
+            metrics["grad_norm"] = norm
+        self.optimizer.step()
+        self.target_updater.step()
+        self.updates += 1
+        if self.settings.priority_exponent is not None:
+            self.buffer.update_priority(sample["index"][:, 0], priority)
+        return {name: value.detach() for name, value in metrics.items()}
+
+    def _watch_gradients(self, loss: Tensor) -> Tensor:
+        """Norm of all gradients; an update in which something is not finite goes no further."""
+        gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
+        norm = torch.nn.utils.get_total_norm(gradients.values())
+        skip = self.guard.watch(loss, gradients, norm, f"update {self.updates + 1}, frame {self.frames}")
+        if skip is not None:
+            self.optimizer.found_inf = skip  # type: ignore[attr-defined]  # read by torch's fused Adam
+        return norm
+
+    def _clip_gradients(self, largest: float, norm: Tensor) -> None:
+        """Clips the gradients of each part for itself; ``norm`` is that of all together."""
+        groups = [group["params"] for group in self.optimizer.param_groups]
+        for parameters in groups:
+            if len(groups) > 1:
+                norm = torch.nn.utils.get_total_norm([each.grad for each in parameters if each.grad is not None])
+            torch.nn.utils.clip_grads_with_norm_(parameters, largest, norm)
+
+    def copy_to_target(self) -> None:
+        """Makes the target network the same as the one that is trained."""
+        HardUpdate(self.loss, value_network_update_interval=1).step()
+
+    def check_finite(self) -> None:
+        """Looks at all updates since the last call, on devices where :meth:`update` does not look at each.
+
+        :meth:`store` and :meth:`state_dict` call it, too.
+
+        Raises:
+            NonFiniteError: as :meth:`update`.
+        """
+        self.guard.check()
+
+    def state_dict(self, *, memory: bool = True) -> dict[str, Any]:
+        """All that learning depends on: both networks, optimiser, replay memory, counters.
+
+        Args:
+            memory: whether to include what :meth:`memory_state_dict` returns.
+        """
+        self.check_finite()
+        rest = {
+            "loss": self.loss.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "extract": self.extract.state_dict(),
+            "updates": self.updates,
+            "frames": self.frames,
+            "warm_at": self._warm_at,
+            "precision": self.precision,
+        }
+        return rest | self.memory_state_dict() if memory else rest
+
+    def memory_state_dict(self) -> dict[str, Any]:
+        """The replay memory, the minibatches drawn from it and when it is warm: large, and the rest goes without."""
+        return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self._warm_at}
+
+    def load_memory_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`memory_state_dict` returned."""
+        self.buffer.load_state_dict(state["buffer"])
+        self._drawn, self._warm_at = list(state["drawn"]), state["warm_at"]
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up anew.
+
+        Raises:
+            ValueError: if it can't be what a learner of these settings returned.
+        """
+        self._check_counters(state)
+        self._continuity.reset()
+        self._check_optimizer(state["optimizer"])
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        _lay_out_like_parameters(self.optimizer)
+        self.extract.load_state_dict(state["extract"])
+        self.updates, self.frames = state["updates"], state["frames"]
+        if "buffer" in state:
+            self.load_memory_state_dict(state)
+        else:
+            if len(self.buffer):
+                self.buffer.empty()
+            done = math.ceil(self.updates * self.settings.frames_per_update)
+            self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)
+        if self.settings.precision == "auto":  # another machine might choose another one
+            self.precision = choose_precision(state.get("precision", "fp32"), self.network)
+
+    def _check_optimizer(self, stored: Mapping[str, Any]) -> None:
+        """Refuses moments of other shapes, which Adam would not notice, and other options than its own."""
+        own = self.optimizer.state_dict()["param_groups"]
+        parameters = [each for group in self.optimizer.param_groups for each in group["params"]]
+        same = [
+            all(theirs[key] == mine[key] for key in mine.keys() & theirs.keys() - {"lr"})
+            for mine, theirs in zip(own, stored["param_groups"], strict=True)
+        ]
+        fits = all(
+            0 <= index < len(parameters)
+            and all(
+                moment.dtype == parameters[index].dtype and moment.shape in (torch.Size(), parameters[index].shape)
+                if name == "step"
+                else (moment.dtype, moment.shape) == (parameters[index].dtype, parameters[index].shape)
+                for name, moment in moments.items()
+            )
+            and {"step", "exp_avg", "exp_avg_sq"} <= moments.keys()
+            for index, moments in stored["state"].items()
+        )
+        if not (all(same) and fits):
+            raise ValueError(
+                "the stored optimiser must have the parameters, shapes and options of this one, got others; load it "
+                "with the settings that it was saved with."
+            )
+
+    def _check_counters(self, state: Mapping[str, Any]) -> None:
+        """Refuses counts that no training has: an update would be made for each one that is missing."""
+        for name in ("updates", "frames", "warm_at"):
+            value = state[name]
+            if not isinstance(value, int) or not 0 <= value < 2**53:
+                raise ValueError(
+                    f"the stored learner's {name} must be a whole number in [0, 2**53), got {value!r}; it is damaged: "
+                    "use another checkpoint."
+                )
+        owed = state["frames"] - state["warm_at"] - state["updates"] * self.settings.frames_per_update
+        if owed > max(self.settings.capacity, 1_000_000):
+            raise ValueError(
+                f"the stored learner's updates must make up for its frames, got {state['updates']} for "
+                f"{state['frames']}; load it with the frames_per_update that it was saved with, or use another one."
+            )
+
+
+def _group(parameters: Mapping[str, Parameter], separate: Mapping[str, float]) -> list[tuple[float, list[Parameter]]]:
+    """Shares of the learning rate and whose they are: all that is not separate first."""
+    groups: dict[str, tuple[float, list[Parameter]]] = {name: (rate, []) for name, rate in separate.items()}
+    rest: list[Parameter] = []
+    for name, parameter in parameters.items():
+        part = next((each for each in separate if name.startswith(each)), None)
+        (rest if part is None else groups[part][1]).append(parameter)
+    for name, (rate, members) in groups.items():
+        if not members or rate <= 0:
+            raise ValueError(
+                f"separate must map beginnings of parameters' names to shares > 0 of the learning rate, got "
+                f"{name!r}: {rate}, which {len(members)} parameters have; look at network.named_parameters()."
+            )
+    return [(1.0, rest), *groups.values()]
+
+
+def _lay_out_like_parameters(optimizer: torch.optim.Optimizer) -> None:
+    """Gives loaded moments the strides of their parameters: fused Adam goes through the memory of both side by side.
+
+    Files hold contiguous tensors, and convolutions have their channels last.
+    """
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if isinstance(value, Tensor) and value.shape == parameter.shape:
+                state[name] = torch.empty_like(parameter).copy_(value)

@@ -1,0 +1,143 @@
+"""How one level of the agent learns: what is replayed, how often, and towards which targets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hdrqn_torchrl.data import FROM_STARTS, Sampling
+from hdrqn_torchrl.learning.precision import Precision
+from hdrqn_torchrl.objectives import check_returns, target_lookahead
+
+
+@dataclass(frozen=True, kw_only=True)
+class LearnerSettings:
+    """How one level learns. The defaults are the paper's where it states them.
+
+    :class:`~hdrqn_torchrl.learning.learner.Learner` reads what concerns drawing and stepping. ``burn_in``,
+    ``train_exact_states``, ``stored_state``, ``loss_function``, ``double`` and ``max_target`` concern the loss and what
+    is stored for it; the builders of :mod:`hdrqn_torchrl.algorithms` pass them on.
+
+    Args:
+        slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level). What its
+            targets need beyond them is drawn, too (:meth:`lookahead`). ``None``, for v3 only: what the task asks for
+            (see :func:`~hdrqn_torchrl.algorithms.make_v3`).
+        batch_size: sequences of a minibatch.
+        capacity: transitions kept in the replay memory.
+        frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
+        warmup_frames: environment frames before the first update.
+        learning_rate: of Adam.
+        learning_rate_end: where it falls to, linearly, until ``learning_rate_frames``; ``None``: it stays.
+        learning_rate_frames: environment frames that this takes.
+        tau: rate of the soft target update.
+        max_grad_norm: gradients are clipped to this norm; ``None``: not at all.
+        burn_in: share of a sequence left out of the loss at its beginning; its steps only bring the recurrent state up
+            to date. (Gradients flow back through it: what is remembered there is learned, too.) None without memory.
+        train_exact_states: train leading steps whose recurrent state is exact (see
+            :func:`~hdrqn_torchrl.objectives.training_mask`).
+        stored_state: store the recurrent state that acting had at each step, and let sequences that begin in
+            mid-episode start from it instead of from zero (R2D2; Kapturowski et al., 2019). Costs 8 H bytes a step.
+        sampling: how sequences are drawn (see :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
+        priority_exponent: alpha: draw sequences in proportion to ``priority**alpha``, where the priority is what the
+            loss reports; R2D2 has 0.9. ``None``: all alike.
+        importance_exponent: beta: weights ``priority**(-alpha * beta)`` make up for it in the loss; 1: in full.
+        loss_function: ``"l2"`` or ``"smooth_l1"``.
+        double: Double DQN.
+        max_target: largest return there can be; targets are cut off above it. ``None``: what the task states, if it
+            states one; ``"unbounded"``: they are not cut off.
+        trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
+        n_step: rewards of a target; 1: one-step targets.
+        precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (:func:`~hdrqn_torchrl.learning.precision.choose_precision`).
+
+    Raises:
+        ValueError: if a value breaks its rule.
+    """
+
+    slice_len: int | None = 8
+    batch_size: int = 32
+    capacity: int = 100_000
+    frames_per_update: float = 8.0
+    warmup_frames: int = 5_000
+    learning_rate: float = 1e-3
+    learning_rate_end: float | None = None
+    learning_rate_frames: int = 1_000_000
+    tau: float = 1e-3
+    max_grad_norm: float | None = None
+    burn_in: float = 0.5
+    train_exact_states: bool = True
+    stored_state: bool = False
+    sampling: Sampling = "steps"
+    priority_exponent: float | None = None
+    importance_exponent: float = 0.6
+    loss_function: Literal["l2", "smooth_l1"] = "l2"
+    double: bool = True
+    max_target: float | Literal["unbounded"] | None = None
+    trace_decay: float = 0.0
+    n_step: int = 1
+    precision: Precision | Literal["auto"] = "fp32"
+
+    def __post_init__(self) -> None:
+        check_returns(self.trace_decay, self.n_step)
+        slice_len = 2 if self.slice_len is None else self.slice_len
+        rules = (
+            ("slice_len", slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
+            ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
+            ("capacity", self.capacity >= slice_len, ">= slice_len", "use 100000 for steps, 50000 for options"),
+            ("frames_per_update", self.frames_per_update > 0, "> 0", "use 8"),
+            ("warmup_frames", self.warmup_frames >= 0, ">= 0", "use 5000"),
+            ("learning_rate", self.learning_rate > 0, "> 0", "the paper uses 0.001"),
+            (
+                "learning_rate_end",
+                self.learning_rate_end is None or 0 < self.learning_rate_end <= self.learning_rate,
+                f"in (0, learning_rate={self.learning_rate}] or None",
+                "use None for a constant rate",
+            ),
+            ("learning_rate_frames", self.learning_rate_frames >= 1, ">= 1", "use the frames of the whole training"),
+            ("burn_in", 0 <= self.burn_in < 1, "in [0, 1)", "the paper's last-half rule is 0.5"),
+            ("tau", 0 < self.tau <= 1, "in (0, 1]", "the paper uses 0.001"),
+            (
+                "train_exact_states",
+                self.train_exact_states or not (self.burn_in and self.sampling in FROM_STARTS),
+                f"True with burn_in={self.burn_in} and sampling={self.sampling!r}",
+                "the first steps of an episode would never be trained; or use burn_in=0",
+            ),
+            (
+                "stored_state",
+                not (self.stored_state and self.sampling in FROM_STARTS),
+                f"False with sampling={self.sampling!r}",
+                "all its sequences begin where an episode does, and there the state is zero",
+            ),
+            (
+                "priority_exponent",
+                self.priority_exponent is None or 0 < self.priority_exponent <= 1,
+                "in (0, 1] or None",
+                "use 0.9, or None to draw all alike",
+            ),
+            ("importance_exponent", 0 <= self.importance_exponent <= 1, "in [0, 1]", "use 0.6"),
+            ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),
+            (
+                "slice_len",
+                not self.trace_decay or slice_len > 1,
+                "> 1 where trace_decay > 0",
+                "a sequence of one transition has no next target to take over",
+            ),
+        )
+        for name, holds, rule, remedy in rules:
+            if not holds:
+                raise ValueError(f"{name} must be {rule}, got {getattr(self, name)}; {remedy}.")
+
+    def lookahead(self, trace_decay: float | None = None) -> int:
+        """Transitions that are drawn beyond ``slice_len``, so that targets are not cut short.
+
+        Sequences from the start of an episode are meant to cover it, and have none for Q(lambda).
+
+        Args:
+            trace_decay: lambda; ``None``: that of these settings.
+
+        Raises:
+            ValueError: if ``slice_len`` is ``None``.
+        """
+        decay = self.trace_decay if trace_decay is None else trace_decay
+        if self.slice_len is None:
+            raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
+        return target_lookahead(0.0 if self.sampling in FROM_STARTS else decay, self.n_step, self.slice_len)

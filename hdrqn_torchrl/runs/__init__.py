@@ -1,0 +1,1 @@
+"""Runs: the training loop, evaluations, checkpoints, and the folder that they leave behind."""

@@ -1,0 +1,273 @@
+"""What episodes bring: sums per episode while training, and greedy evaluation on fixed seeds."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, ExplorationType
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs import Task, task_of
+from hdrqn_torchrl.runs.isolation import isolated
+
+_SUMMED = {
+    "return": keys.REWARD,
+    "extrinsic": keys.EXTRINSIC_REWARD,
+    "intrinsic": keys.INTRINSIC_REWARD,
+    "success": keys.SUCCESS,
+}
+_FIGURES = {
+    "return_mean": "return",
+    "extrinsic_mean": "extrinsic",
+    "intrinsic_mean": "intrinsic",
+    "success_rate": "success",
+    "in_order_rate": "in_order",
+    "steps_mean": "steps",
+    "cut_off_rate": "cut_off",
+}
+LONGEST_EPISODE = 10_000
+"""Steps after which an episode of unknown length is taken to have no end; tasks of longer ones state their length."""
+PATIENCE = 1_000
+"""Steps after which it is said that this is being waited for."""
+
+
+class Observer(Protocol):
+    """Something that counts what happens."""
+
+    def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
+        """Takes one step of all environments ``[N]``, its outcome below ``"next"``.
+
+        Args:
+            step: of all environments.
+            counted: which of them count, ``[N]`` bool; ``None``: all.
+        """
+        ...
+
+
+class PlaceCounter:
+    """Counts where agents are on a screen: a heat map.
+
+    Args:
+        height, width: of the screen in pixels.
+        cell: side of a cell of the map in pixels.
+
+    Examples:
+        >>> places = PlaceCounter(8, 8, cell=4)
+        >>> after = {"position": torch.tensor([[1.0, 2.0], [7.0, 3.0]])}
+        >>> places.add_step(TensorDict({"next": after}, [2]))
+        >>> places.counts.tolist()
+        [[1, 1], [0, 0]]
+    """
+
+    def __init__(self, height: int, width: int, cell: int = 2) -> None:
+        self.cell = cell
+        self.counts = torch.zeros(-(-height // cell), -(-width // cell), dtype=torch.int64)
+
+    def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
+        """Reads ``position`` after one step of all environments ``[N]``; see :class:`Observer`."""
+        rows, columns = self.counts.shape
+        x, y = (step.get(("next", keys.POSITION)).cpu() / self.cell).long().unbind(-1)
+        index = y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)
+        weight = torch.ones_like(index) if counted is None else counted.cpu().long()
+        self.counts.view(-1).index_add_(0, index, weight)
+
+
+class EpisodeTracker:
+    """Sums what happens in each of N environments and reports the episodes that end.
+
+    Reported per episode: ``return``, ``steps`` and, as far as environment and agent have them, ``extrinsic``,
+    ``intrinsic``, ``success`` (1 if the whole task was completed) and ``in_order`` (share of subgoals reached in the
+    proper order, where the task has one).
+
+    Args:
+        task: says how ``in_order`` is counted.
+        per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
+            attained, options for it that ended, and those of them that reached it.
+    """
+
+    def __init__(self, task: Task = Task(), *, per_subgoal: bool = False) -> None:  # noqa: B008 (frozen)
+        self.task, self.per_subgoal = task, per_subgoal
+        self.sums: TensorDictBase | None = None  # [N]
+
+    def add(self, after: TensorDictBase) -> TensorDictBase:
+        """Takes one step of all environments (what the environment wrote, ``[N]``).
+
+        Returns:
+            The sums ``[N]`` up to and including this step; those of ended episodes are cleared afterwards.
+        """
+        step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after}
+        if self.task.in_order is not None:
+            step["in_order"] = self.task.in_order(after)
+        step["steps"] = torch.ones_like(step["return"])
+        if self.per_subgoal:
+            step |= _subgoal_events(after)
+        sums = TensorDict(step, after.batch_size, device=after.device)
+        if self.sums is not None:
+            sums = sums + self.sums
+        self.sums = sums.clone().masked_fill_(after.get(keys.DONE).squeeze(-1), 0.0)
+        return sums
+
+    def finished(self, batch: TensorDictBase) -> TensorDictBase:
+        """Takes a collected batch ``[N, T]``; returns the episodes ``[M]`` that ended in it."""
+        after = batch.get("next").transpose(0, 1)  # [T, N]
+        sums: TensorDictBase = torch.stack([self.add(step) for step in after.unbind(0)], 0)  # type: ignore[assignment]
+        return sums[after.get(keys.DONE).squeeze(-1)]
+
+    def state_dict(self) -> dict[str, TensorDictBase | None]:
+        """Sums of the episodes in progress."""
+        return {"sums": self.sums}
+
+    def load_state_dict(self, state: dict[str, TensorDictBase | None]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.sums = state["sums"]
+
+
+def _subgoal_events(after: TensorDictBase) -> dict[str, Tensor]:
+    """What happened to each subgoal in one step, ``[N, G]`` each."""
+    if keys.ATTAINED not in after:
+        return {}
+    attained = after.get(keys.ATTAINED).float()
+    if keys.OPTION_DONE not in after:
+        return {"attained": attained}
+    active = torch.nn.functional.one_hot(after.get(keys.ACTIVE_SUBGOAL), attained.shape[-1]).float()
+    return {
+        "attained": attained,
+        "chosen": active * after.get(keys.OPTION_DONE),
+        "reached": active * after.get(keys.SUBGOAL_REACHED),
+    }
+
+
+@torch.no_grad()
+def play(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    episodes: int,
+    seed: int = 0,
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    observers: Sequence[Observer] = (),
+    max_steps: int | None = None,
+) -> TensorDictBase:
+    """Plays episodes, in rounds of one in each environment.
+
+    Nothing changes in a training that goes on meanwhile (:func:`~hdrqn_torchrl.runs.isolation.isolated`).
+    Every environment contributes the same number of episodes: taking the first that finish would favour short
+    ones. (TorchRL's ``Evaluator`` does that, hence this function.)
+
+    Before each round environment and random numbers are seeded anew, from ``seed`` and the round's number. So episode i
+    begins in the same world for every policy, whatever was played before, and differences between two policies can be
+    taken episode by episode. Which world that is depends on ``seed`` and N. What an environment draws later in an
+    episode (sticky actions, obstacles that move) is as alike as it makes it.
+
+    Args:
+        env: environment with batch size ``[N]``, not that of a training: its episodes would be lost.
+        policy: greedy under the default ``exploration_type``.
+        episodes: number of episodes, rounded up to a multiple of N.
+        seed: of the first round; those of the others are derived from it.
+        exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
+        observers: are shown every step and told where it belongs to an episode that counts: environments that are done
+            with theirs go on, and short episodes would be seen too often.
+        max_steps: episodes are cut off after so many steps, if they have not ended before; ``None``: not at all.
+
+    Returns:
+        One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)`` and, if ``max_steps`` is
+        given, ``cut_off`` (1 if it was).
+
+    Raises:
+        ValueError: if ``max_steps`` is below 1, or if without it an episode does not end: after as many steps as the
+            task states or, if it states none, :data:`LONGEST_EPISODE`.
+    """
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None plays episodes to their end.")
+    rounds, task = [], task_of(env)
+    for number in range(-(-episodes // env.batch_size[0])):
+        with isolated(env, policy, seed=seed_of_round(seed, number), exploration_type=exploration_type):
+            rounds.append(_play_once(env, policy, observers, task, max_steps))
+    return torch.cat(rounds, 0)  # type: ignore[return-value]
+
+
+def seed_of_round(seed: int, number: int) -> int:
+    """Seed of a round of episodes: ``seed`` itself for the first; neighbouring seeds share none of the others.
+
+    Examples:
+        >>> seed_of_round(7, 0), seed_of_round(7, 1) == seed_of_round(8, 1)
+        (7, False)
+    """
+    if number == 0:
+        return seed
+    return int(numpy.random.SeedSequence([seed % 2**64, number]).generate_state(1)[0]) >> 1  # 31 bits suit every env
+
+
+def evaluate(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    episodes: int,
+    seed: int = 0,
+    exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
+    max_steps: int | None = None,
+) -> dict[str, float]:
+    """Plays episodes and averages them; arguments as in :func:`play`.
+
+    Returns:
+        ``return_mean``, ``steps_mean``, ``episodes`` and, as far as environment and agent have them,
+        ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete the whole task),
+        ``in_order_rate`` (share of subgoals reached in the proper order), ``cut_off_rate``.
+    """
+    played = play(env, policy, episodes=episodes, seed=seed, exploration_type=exploration_type, max_steps=max_steps)
+    return {**{name: _mean(values) for name, values in columns(played).items()}, "episodes": len(played)}
+
+
+def columns(played: TensorDictBase) -> dict[str, Tensor]:
+    """The figures that a result consists of, one value per episode ``[M]`` each."""
+    return {name: played[entry] for name, entry in _FIGURES.items() if entry in played}
+
+
+def _play_once(
+    env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[Observer], task: Task, max_steps: int | None
+) -> TensorDictBase:
+    """One episode in each environment, ``[N]``."""
+    tensordict, tracker = env.reset(), EpisodeTracker(task, per_subgoal=True)
+    playing = torch.ones(env.batch_size, dtype=torch.bool, device=tensordict.device)
+    episodes: TensorDictBase | None = None
+    longest = max_steps or task.max_steps or LONGEST_EPISODE
+    for step in range(longest):
+        if step == PATIENCE and max_steps is None and task.max_steps is None:
+            warnings.warn(
+                f"env should end its episodes or state how long they are, got {int(playing.sum())} of {len(playing)} "
+                f"that have not ended after {step:,} steps; an evaluation waits for {longest:,}, or for max_steps "
+                "(evaluation.max_steps on the command line).",
+                stacklevel=4,
+            )
+        tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+        after = tensordict.get("next")
+        sums = tracker.add(after)
+        for observer in observers:
+            observer.add_step(tensordict, playing)
+        ended = playing & after.get(keys.DONE).squeeze(-1)
+        episodes = sums if episodes is None else torch.where(ended, sums, episodes)
+        playing, tensordict = playing & ~ended, following
+        if not playing.any():
+            break
+    assert episodes is not None
+    if max_steps is not None:
+        cut: TensorDictBase = torch.where(playing, sums, episodes)  # type: ignore[assignment]
+        return cut.set("cut_off", playing.float())
+    if playing.any():
+        raise ValueError(
+            f"env must end its episodes, got {int(playing.sum())} of {len(playing)} that had not ended after "
+            f"{longest:,} steps; give it a time limit (StepCounter(max_steps=...), before the agent's own transforms), "
+            "state the length of longer ones in its task, or let evaluations cut them off (max_steps)."
+        )
+    return episodes
+
+
+def _mean(values: Tensor) -> float:
+    return values.mean().item()

@@ -1,0 +1,380 @@
+"""The training loop. It owns time; learning is the learners' business, and it knows no algorithm.
+
+TorchRL's ``Trainer`` is not used: it keeps its counters on the class, so that two trainings in one process
+share them (a sweep does just that), and hands every optimiser step one batch from one buffer, where each of our
+learners draws from its own.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.collectors import BaseCollector
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.learning import Learner
+from hdrqn_torchrl.learning.finite import NonFiniteError
+from hdrqn_torchrl.runs.checkpoint import MEMORY, Checkpoints, RandomState
+from hdrqn_torchrl.runs.evaluation import EpisodeTracker
+from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
+from hdrqn_torchrl.runs.logging import Row, RunLogger
+from hdrqn_torchrl.runs.state_checks import rules_of
+
+
+class Trainer:
+    """Collects, stores, updates, logs, evaluates and saves until ``total_frames`` are done.
+
+    An iteration can be cut between any two updates: what is left of it is owed, and done first when the training
+    goes on. A training that was stopped and resumed is bit for bit the one that was not.
+
+    Args:
+        algorithm: policy and learners.
+        collector: yields batches ``[N, T]`` from the transformed environment. If ``checkpoints`` are given it must
+            keep its state (:class:`~hdrqn_torchrl.runs.collectors.ResumableCollector`).
+        logger: where log points go.
+        evaluate: plays greedy episodes and returns their averages (:func:`~hdrqn_torchrl.runs.evaluation.evaluate`).
+        total_frames: environment frames to collect.
+        log_frames: frames between log points.
+        evaluation_frames: frames between greedy evaluations; the first comes before training.
+        checkpoints: where the whole training is saved; ``None``: nowhere.
+        checkpoint_frames: frames between checkpoints.
+        checkpoint_seconds: seconds after which one is written in any case.
+        ceiling: return of a scripted player, logged beside the greedy one.
+    """
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        collector: BaseCollector,
+        *,
+        logger: RunLogger,
+        evaluate: Callable[[], dict[str, float]],
+        total_frames: int,
+        log_frames: int = 10_000,
+        evaluation_frames: int = 50_000,
+        checkpoints: Checkpoints | None = None,
+        checkpoint_frames: int = 50_000,
+        checkpoint_seconds: float = 600.0,
+        ceiling: float | None = None,
+    ) -> None:
+        self.algorithm, self.collector, self.logger, self.evaluate = algorithm, collector, logger, evaluate
+        self.total_frames, self.log_frames, self.evaluation_frames = total_frames, log_frames, evaluation_frames
+        self.checkpoints, self.checkpoint_frames = checkpoints, checkpoint_frames
+        self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
+        self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
+        self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
+        self._tracker, self._window = (
+            EpisodeTracker(algorithm.task, per_subgoal=algorithm.phases is not None),
+            _Window(),
+        )
+        self._stop = StopRequest()
+        self._started = self._saved_at = time.monotonic()
+        self._saved_position: tuple | None = None
+
+    @property
+    def wall_seconds(self) -> float:
+        """Seconds of training, those before an interruption included."""
+        return time.monotonic() - self._started
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps of all learners together."""
+        return sum(learner.updates for learner in self.algorithm.learners.values())
+
+    def train(self) -> None:
+        """Runs to ``total_frames``.
+
+        Raises:
+            Interrupted: on SIGINT or SIGTERM, after saving. A second signal does not wait for that.
+            NonFiniteError: before a NaN or an infinity reaches the weights.
+            CheckpointError: if the training can't be saved.
+        """
+        try:
+            with self._stop:
+                self._run()
+        finally:
+            self.logger.close()
+
+    def _run(self) -> None:
+        try:
+            self._complete_iteration()
+            if self.frames < self.total_frames:
+                for batch in self.collector:
+                    self.step(batch)
+                    if self.frames >= self.total_frames:
+                        break
+            self.save()
+        except Interrupted:
+            self.save()
+            raise
+        except NonFiniteError as error:
+            left = "nothing was saved" if self.checkpoints is None else self.checkpoints.last_good()
+            raise NonFiniteError(f"{error}; training stopped before it could reach the weights; {left}.") from error
+
+    def step(self, batch: TensorDictBase) -> None:
+        """One iteration on a collected batch ``[N, T]``."""
+        self._receive(batch)
+        self._complete_iteration()
+
+    def _receive(self, batch: TensorDictBase) -> None:
+        """Counts and stores a collected batch ``[N, T]``."""
+        check_finite(batch, self.frames)
+        self.frames += batch.numel()
+        self.algorithm.observe(batch)
+        finished = self._tracker.finished(batch)
+        self.episodes += len(finished)
+        self._window.add_episodes(finished)
+
+    def _complete_iteration(self) -> None:
+        """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
+        for name, learner in self.algorithm.learners.items():
+            with _naming(name):
+                for _ in range(learner.updates_due()):
+                    self._stop.check()
+                    self._window.add_update(name, learner.update(learner.sample()))
+                learner.check_finite()
+        self.collector.update_policy_weights_()
+        before, best = self._completed, False
+        if before != self.frames:
+            evaluation = self._due(self.evaluation_frames) or self.frames >= self.total_frames
+            if evaluation or self._due(self.log_frames):
+                best = self.log(evaluation=evaluation)
+            self._completed = self.frames
+        late = time.monotonic() - self._saved_at >= self.checkpoint_seconds
+        if before is not None and (best or late or crossed(before, self.frames, self.checkpoint_frames)):
+            self.save(score=self.best_return if best else None)
+        self._stop.check()
+
+    def _due(self, interval: int) -> bool:
+        """Whether a multiple of ``interval`` was passed in this iteration; at the very beginning, too."""
+        return self._completed is None or crossed(self._completed, self.frames, interval)
+
+    def log(self, *, evaluation: bool) -> bool:
+        """Writes one log point, after a greedy evaluation if asked for. Returns whether that was the best so far."""
+        row: Row = {
+            "frames": self.frames,
+            "episodes": self.episodes,
+            "updates": self.updates,
+            "wall_seconds": round(self.wall_seconds, 2),
+            **self._window.summary(self.frames),
+            **{f"{name}/updates": learner.updates for name, learner in self.algorithm.learners.items()},
+            **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
+            **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
+            **({} if self.algorithm.phases is None else self.algorithm.phases.metrics()),
+        }
+        best = False
+        if evaluation:
+            with self._stop.at_once():
+                result = self.evaluate()
+            row |= {
+                f"greedy/{name.removesuffix('_mean').removesuffix('_rate')}": value for name, value in result.items()
+            }
+            if self.ceiling is not None:
+                row["greedy/ceiling"] = self.ceiling
+            if best := result["return_mean"] > self.best_return:
+                self.best_return = result["return_mean"]
+        self.logger.log(row)
+        self._begin_row()
+        return best
+
+    def _begin_row(self) -> None:
+        """Starts counting anew; only now that a row is on the disk: a stop before would lose what was counted."""
+        self._window = _Window(self.frames)
+        if self.algorithm.phases is not None:
+            self.algorithm.phases.clear()
+
+    def save(self, *, score: float | None = None) -> None:
+        """Writes a checkpoint of the whole training, unless nothing happened since the last one.
+
+        Args:
+            score: greedy return of these very weights, if it is the best so far.
+        """
+        if self.checkpoints is not None and self._position != self._saved_position:
+            self.checkpoints.save(self._components(), step=self.frames, score=score)
+            self._saved_at, self._saved_position = time.monotonic(), self._position
+
+    def resume(self, path: Path) -> None:
+        """Restores everything from a checkpoint; :meth:`train` then goes on from there, and later ones are removed.
+
+        Raises:
+            CheckpointError: if the checkpoint is damaged or of another kind of training.
+        """
+        assert self.checkpoints is not None
+        device = next(self.algorithm.policy.parameters()).device
+        rules = rules_of(self.collector.env) if hasattr(self.collector, "env") else {}  # others are made elsewhere
+        missing = self.checkpoints.load(self._components(), path, device=device, rules=rules)
+        self.checkpoints.go_back_to(self.frames)
+        self.collector.update_policy_weights_()
+        self._saved_at, self._saved_position = time.monotonic(), self._position
+        if missing and not any(len(learner.buffer) for learner in self.algorithm.learners.values()):
+            self.logger.say(
+                f"{path.name} holds no replay memory: it begins empty and is warmed up anew, so that the training goes "
+                "on, but not bit for bit as it would have"
+            )
+
+    @property
+    def _position(self) -> tuple[int, int, int | None]:
+        return self.frames, self.updates, self._completed
+
+    def _components(self) -> dict[str, Any]:
+        """All that a training consists of. They are restored in the order of their names."""
+        return {
+            "collector": self.collector,
+            **{f"learner-{name}": _but_memory(learner) for name, learner in self.algorithm.learners.items()},
+            **{f"{MEMORY}{name}": _memory(learner) for name, learner in self.algorithm.learners.items()},
+            "logger": self.logger,
+            **({} if self.algorithm.phases is None else {"phases": self.algorithm.phases}),
+            "policy": self.algorithm.policy,
+            "random": RandomState(),
+            "trainer": self,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Its own counters; the parts have theirs."""
+        return {
+            "frames": self.frames,
+            "episodes": self.episodes,
+            "best_return": self.best_return,
+            "completed": self._completed,
+            "wall_seconds": self.wall_seconds,
+            "tracker": self._tracker.state_dict(),
+            "window": self._window.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned.
+
+        Raises:
+            ValueError: if it can't be what a trainer returned.
+        """
+        _check_counters(state)
+        self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
+        self._completed = state["completed"]
+        self._started = time.monotonic() - state["wall_seconds"]
+        self._tracker.load_state_dict(state["tracker"])
+        self._window.load_state_dict(state["window"])
+
+
+class _Part:
+    """A component by its two methods."""
+
+    def __init__(self, save: Callable[[], dict[str, Any]], load: Callable[[dict[str, Any]], None]) -> None:
+        self.state_dict, self.load_state_dict = save, load
+
+
+def _but_memory(learner: Learner) -> _Part:
+    return _Part(partial(learner.state_dict, memory=False), learner.load_state_dict)
+
+
+def _memory(learner: Learner) -> _Part:
+    return _Part(learner.memory_state_dict, learner.load_memory_state_dict)
+
+
+def _check_counters(state: dict[str, Any]) -> None:
+    window, sums = state["window"], state["tracker"]["sums"]
+    counts = [state["frames"], state["episodes"], window["frames"], state["completed"] or 0, *window["counts"].values()]
+    times = [state["wall_seconds"], window["seconds"]]
+    fine = all(type(count) is int and 0 <= count < 2**53 for count in counts)
+    fine &= all(isinstance(each, (int, float)) and 0 <= each < 2**53 for each in times)
+    fine &= isinstance(state["best_return"], float) and state["best_return"] < math.inf
+    fine &= sums is None or (isinstance(sums, TensorDictBase) and sums.ndim == 1)
+    fine &= all(isinstance(each, TensorDictBase) and each.ndim == 1 for each in window["episodes"])
+    if not fine:
+        raise ValueError("the stored trainer's counts must be those of a training, got others; use another checkpoint.")
+
+
+def crossed(before: int, after: int, interval: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
+@contextmanager
+def _naming(learner: str) -> Iterator[None]:
+    """Puts the learner's name before its complaint."""
+    try:
+        yield
+    except NonFiniteError as error:
+        raise NonFiniteError(f"{learner}: {error}") from error
+
+
+def check_finite(batch: TensorDictBase, frames: int) -> None:
+    """Refuses a collected batch ``[N, T]`` with a NaN or an infinity in it.
+
+    Raises:
+        NonFiniteError: naming the place and the entry that came first; others follow from it.
+    """
+    floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
+    if torch.stack([torch.isfinite(value).all() for value in floats.values()]).all():
+        return
+    found = []
+    for key, value in floats.items():
+        if not torch.isfinite(value).all():
+            wrong = ~torch.isfinite(value).reshape(*batch.shape, -1).all(-1)
+            time, environment = wrong.t().nonzero()[0].tolist()
+            name = ".".join(key) if isinstance(key, tuple) else key
+            found.append((time, *(cause not in name for cause in (keys.OBSERVATION, keys.REWARD)), name, environment))
+    *_, name, environment = min(found)
+    raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")
+
+
+class _Window:
+    """What happened since the last log point; tensors stay on their device until it is summed up."""
+
+    def __init__(self, frames: int = 0) -> None:
+        self._frames, self._since = frames, time.monotonic()
+        self._episodes: list[TensorDictBase] = []
+        self._sums: dict[str, dict[str, Tensor]] = {}
+        self._counts: dict[str, int] = {}
+
+    def add_episodes(self, episodes: TensorDictBase) -> None:
+        if len(episodes):
+            self._episodes.append(episodes)
+
+    def add_update(self, learner: str, metrics: dict[str, Tensor]) -> None:
+        sums = self._sums.get(learner)
+        self._sums[learner] = metrics if sums is None else {name: sums[name] + value for name, value in metrics.items()}
+        self._counts[learner] = self._counts.get(learner, 0) + 1
+
+    def summary(self, frames: int) -> Row:
+        seconds = max(time.monotonic() - self._since, 1e-9)
+        row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
+        if self._episodes:
+            episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
+            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items() if value.ndim == 1}
+            if "attained" in episodes:
+                row |= _visits(episodes["attained"])
+        for learner, sums in self._sums.items():
+            count = self._counts[learner]
+            row |= {f"{learner}/{name}": (total / count).item() for name, total in sums.items()}
+            row[f"{learner}/updates_per_second"] = round(count / seconds, 1)
+        return row
+
+    def state_dict(self) -> dict[str, Any]:
+        return {
+            "frames": self._frames,
+            "seconds": time.monotonic() - self._since,
+            "episodes": self._episodes,
+            "sums": self._sums,
+            "counts": self._counts,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._frames, self._since = state["frames"], time.monotonic() - state["seconds"]
+        self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]
+
+
+def _visits(attained: Tensor) -> Row:
+    """Share of episodes ``[M, G]`` that attained each subgoal, and how often they did."""
+    shares, visits = (attained > 0).float().mean(0).tolist(), attained.mean(0).tolist()
+    row: Row = {f"behaviour/attained_{index}": share for index, share in enumerate(shares)}
+    return row | {f"behaviour/visits_{index}": number for index, number in enumerate(visits)}

@@ -1,0 +1,826 @@
+import math
+from copy import deepcopy
+from dataclasses import replace
+from functools import cache
+
+import pytest
+import torch
+from helpers import ALGORITHMS, build, collect, make_collector, parameter_distance, small_env, tiny_settings
+from hydra import compose, initialize_config_dir
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+from user_envs import Corridor
+
+from hdrqn_torchrl.algorithms import V3_LEARNER, make_drqn, make_hdqn, make_hdrqn, make_v3
+from hdrqn_torchrl.cli import configuration
+from hdrqn_torchrl.cli.building import build_algorithm
+from hdrqn_torchrl.data import FROM_STARTS, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.envs import MultiGoalGridEnv, Task
+from hdrqn_torchrl.modules import (
+    EpsilonGreedy,
+    RepeatingEpsilonGreedy,
+    SuccessEpsilonGreedy,
+    compact_network,
+    paper_network,
+)
+
+NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
+
+
+@pytest.mark.parametrize("layout", ["open", "four_rooms"])
+@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("dqn", {}),
+        ("drqn", {}),
+        ("hdqn", {}),
+        ("v1", {}),
+        ("v2", {}),
+        ("v2", {"meta_input": "cell"}),
+        ("v2", {"meta_input": "both"}),
+        ("v2", {"meta_input_time": "after_last_observation"}),
+        ("hdqn", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v1", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v2", {"sub_hindsight": True, "meta_hindsight": True}),
+        ("v3", {}),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "-".join(str(option) for option in value.values()),
+)
+def test_every_algorithm_collects_and_updates_each_level(name, options, network, layout):
+    torch.manual_seed(0)
+    env = MultiGoalGridEnv(4, layout=layout, max_steps=6, seed=0)
+    algorithm = build(name, env, NETWORKS[network], settings=tiny_settings(batch_size=16), **options)
+    learners = {"dqn": ["flat"], "drqn": ["flat"], "v3": ["joint"]}
+    assert list(algorithm.learners) == learners.get(name, ["sub", "meta"])
+    assert list(algorithm.explorations) == (["sub", "meta"] if name == "v3" else list(algorithm.learners))
+    batch = collect(algorithm, env, 8)[0]
+    for learner in algorithm.learners.values():
+        before = [p.detach().clone() for p in learner.network.parameters()]
+        learner.store(batch)
+        metrics = learner.update(learner.sample())
+        assert metrics["loss"] > 0 and metrics["trained_steps"] > 0
+        assert any((p != old).any() for p, old in zip(learner.network.parameters(), before, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "message"),
+    [
+        (
+            {"n_step": 2},
+            {"sub_hindsight": True},
+            r"sub\.n_step must be 1 with sub_hindsight=True, got 2",
+        ),
+        (
+            {"priority_exponent": 0.9},
+            {"sub_hindsight": True},
+            r"sub\.priority_exponent must be None with sub_",
+        ),
+        ({"stored_state": True}, {"sub_hindsight": True}, r"sub\.stored_state must be False with sub_hindsight=True"),
+        (
+            {"stored_state": True},
+            {"meta_hindsight": True},
+            r"meta\.stored_state must be False with meta_",
+        ),
+    ],
+    ids=["n_step", "priorities", "sub-states", "meta-states"],
+)
+def test_what_hindsight_does_not_go_with(settings, options, message):
+    with pytest.raises(ValueError, match=message):
+        build("v2", small_env(4), settings=tiny_settings(**settings), **options)
+
+
+@pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])
+def test_the_environment_as_the_algorithm_sees_it_keeps_its_specs(name):
+    env = small_env(3)
+    check_env_specs(build(name, env).transform(env))
+
+
+@pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])
+def test_the_policy_is_made_of_what_the_learners_train(name):
+    algorithm = build(name, small_env(3))
+    trained = {id(p) for learner in algorithm.learners.values() for p in learner.network.parameters()}
+    assert trained == {id(p) for p in algorithm.policy.parameters()}
+    epsilons = {id(level.epsilon) for level in algorithm.explorations.values()}
+    assert epsilons <= {id(buffer) for buffer in algorithm.policy.buffers()}
+
+
+def unbounded():
+    """Settings of a learner whose targets may be any number."""
+    return tiny_settings(max_target="unbounded")
+
+
+def value_everything_at(learner, value):
+    """Makes the target network's Q-values the same everywhere."""
+    streams = learner.loss.target_value_network_params["network", "head", "streams"]
+    with torch.no_grad():
+        for parameter in streams.values():
+            parameter.zero_()
+        streams["bias"][0] = value
+
+
+def learner_ends(learner):
+    keys = learner.loss.tensor_keys
+    return keys.done, keys.terminated
+
+
+class TestBoundsOfTargets:
+    """Only what the task states bounds what its agents hope for."""
+
+    def bound(self, algorithm, level):
+        loss = algorithm.learners[level].loss
+        return getattr(loss, "max_meta_target" if level == "joint" else "max_target")
+
+    @pytest.mark.parametrize(("name", "level"), [("dqn", "flat"), ("drqn", "flat"), ("v1", "meta"), ("v2", "meta")])
+    def test_the_grid_states_that_a_goal_pays_one(self, name, level):
+        algorithm = build(name, small_env(2, num_goals=3))
+        assert self.bound(algorithm, level) == 3.0
+        settings = tiny_settings(max_target=0.5)
+        assert self.bound(build(name, small_env(2), settings=settings), level) == 0.5
+
+    def test_the_grid_bounds_v3_on_both_sides(self):
+        loss = build("v3", small_env(2, num_goals=3)).learners["joint"].loss
+        assert (loss.min_meta_target, loss.max_meta_target, loss.max_sub_target) == (0.0, 3.0, 1.0)
+        assert build("v3", small_env(2), max_meta_target=0.5).learners["joint"].loss.max_meta_target == 0.5
+
+    @pytest.mark.parametrize(("rewards", "bound"), [({}, 1.0), ({"wrong_subgoal_reward": 0.5}, math.inf)])
+    def test_reaching_a_subgoal_pays_one_unless_more_is_paid(self, rewards, bound):
+        assert self.bound(build("v2", small_env(2), **rewards), "sub") == bound
+        assert build("v3", small_env(2), **rewards).learners["joint"].loss.max_sub_target == bound
+
+    @pytest.mark.parametrize("name", ["dqn", "v1", "v3"])
+    def test_an_environment_that_says_nothing_is_not_bounded_by_the_name_of_an_argument(self, name):
+        level = {"dqn": "flat", "v1": "meta", "v3": "joint"}[name]
+        env = Corridor(4, num_goals=2, pays=10.0, without=("success",))
+        torch.manual_seed(0)
+        options = {"settings": tiny_settings(learning_rate=0.03, tau=0.2)}
+        algorithm = build(name, env, **options, **({"meta_gamma": 1.0} if name == "v3" else {"gamma": 1.0}))
+        assert self.bound(algorithm, level) == math.inf
+        learner = algorithm.learners[level]
+        for batch in collect(algorithm, env, 16, 4):
+            learner.store(batch)
+        for _ in range(300):
+            learner.update(learner.sample())
+        value = "meta_q_value" if name == "v3" else "q_value"
+        assert learner.update(learner.sample())[value] > 4.0
+
+    def test_what_a_user_s_environment_states_bounds_its_agents(self):
+        task = Task(largest_return=40.0, largest_extrinsic_return=20.0, smallest_extrinsic_return=-5.0)
+        env = Corridor(4, pays=10.0, without=("success",), task=task)
+        assert self.bound(build("drqn", env), "flat") == 40.0
+        assert self.bound(build("v2", env), "meta") == 20.0
+        loss = build("v3", env).learners["joint"].loss
+        assert (loss.min_meta_target, loss.max_meta_target) == (-5.0, 20.0)
+
+
+class TestSequencesOfV3:
+    """Unless it is told, v3 takes their length from the task."""
+
+    def settings(self, env, **changes):
+        return make_v3(env, compact_network(8, (8,)), learner=replace(V3_LEARNER, **changes)).learners["joint"].settings
+
+    @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
+    @pytest.mark.parametrize("steps", [1, 50, 200])
+    def test_they_are_whole_episodes_of_up_to_200_steps(self, steps, sampling):
+        settings = self.settings(small_env(2, max_steps=steps), sampling=sampling)
+        assert (settings.slice_len, settings.sampling, settings.stored_state) == (steps, sampling, False)
+
+    @pytest.mark.parametrize("env", [small_env(2, max_steps=201), Corridor(2, length=6)], ids=["long", "unknown"])
+    def test_of_longer_episodes_they_are_short_and_begin_anywhere_from_stored_states(self, env):
+        with pytest.warns(UserWarning, match=r"sequences of 32 steps that begin anywhere, .* give slice_len to have"):
+            settings = self.settings(env)
+        assert (settings.slice_len, settings.sampling, settings.stored_state) == (32, "steps", True)
+        assert settings.burn_in == 0.25
+
+    def test_what_is_given_is_kept(self):
+        env = small_env(2, max_steps=400)
+        assert self.settings(env, slice_len=50) == replace(V3_LEARNER, slice_len=50)
+        given = {"sampling": "steps", "stored_state": True, "burn_in": 0.5}
+        assert self.settings(env, **given) == replace(V3_LEARNER, slice_len=32, **given)
+        with pytest.raises(
+            ValueError, match=r"slice_len must be a number with .*'whole_episodes' and .* up to 400 steps"
+        ):
+            self.settings(env, sampling="whole_episodes")
+
+    def test_of_episodes_of_400_steps_every_one_is_trained(self):
+        """Of a memory of two episodes in each environment, in step: which steps enter the loss?"""
+        env = Corridor(4, length=400, task=Task(max_steps=400))
+        torch.manual_seed(0)
+        settings = replace(V3_LEARNER, capacity=4 * 850, batch_size=64, warmup_frames=0)
+        with pytest.warns(UserWarning, match=r"of up to 400 steps in sequences of 32 steps"):
+            algorithm = make_v3(env, compact_network(8, (8,)), learner=settings, memory_size=8, head_size=8)
+        learner = algorithm.learners["joint"]
+        for batch in collect(algorithm, env, 50, batches=16):
+            learner.store(batch)
+        counts = torch.zeros(400)
+        for _ in range(16):
+            sample = learner.sample()
+            sample["subgoal_mask"].fill_(True)  # both ends are soon attained, and nothing is left to learn about
+            loss, valid = learner.loss, sample["collector", "mask"][:, :-1]
+            events = loss._events(sample[:, :-1], sample["collector", "mask"])
+            trained = loss._trained(sample, valid, events, torch.ones_like(events["attained"]))[0].any(-1)
+            assert (trained.sum(-1) <= 32).all()
+            counts += (sample["index"][:, :-1, 0] % 400)[trained].bincount(minlength=400)
+        assert (counts[:399] > 0).all() and counts[50:].sum() > 6 * counts[:50].sum()
+
+
+def test_the_others_need_a_number():
+    for name in ("drqn", "v1", "v2"):
+        with pytest.raises(ValueError, match="slice_len must be a number, got None; only v3 asks the task"):
+            build(name, small_env(2), settings=tiny_settings(slice_len=None))
+
+
+class TestTasksWithoutEnd:
+    @pytest.mark.parametrize(
+        ("name", "options"),
+        [
+            ("hdqn", {}),
+            ("v1", {"repeatable_subgoals": True}),
+            ("v2", {"meta_hindsight": True, "refresh_hidden_steps": 6}),
+        ],
+        ids=str,
+    )
+    def test_the_meta_level_learns_from_what_happened_so_far(self, name, options):
+        env = Corridor(4, length=None)
+        algorithm = build(name, env, settings=tiny_settings(slice_len=2, capacity=100), max_option_steps=3, **options)
+        meta = algorithm.learners["meta"]
+        for batch in collect(algorithm, env, 10, batches=12):
+            meta.store(batch)
+            for _ in range(meta.updates_due()):
+                assert meta.update(meta.sample())["loss"].isfinite()
+            held = meta.extract.state_dict()["held"]
+            assert len(held) <= 4 * 8 * 2
+        assert len(meta.buffer) == 100 and meta.updates > 10
+        assert meta.buffer.storage[:]["is_init"].sum() <= 4
+
+    def test_episodes_of_usual_length_are_stored_whole_and_others_in_pieces(self):
+        held = [
+            build("v2", small_env(2, max_steps=steps)).learners["meta"].extract.max_held for steps in (50, 1000, 1001)
+        ]
+        assert held == [1000, 1000, 8 * 4]
+
+
+class TestOptions:
+    """Each option changes something."""
+
+    def steps(self, batches=1, name="v2", **options):
+        torch.manual_seed(0)
+        env = small_env(8)
+        algorithm = build(name, env, **options)
+        batch = torch.cat(collect(algorithm, env, 30, batches), 1)
+        return algorithm, batch
+
+    def test_gamma_and_smdp_discount(self):
+        algorithm, batch = self.steps(gamma=0.5)
+        gammas = [learner.loss.gamma.item() for learner in algorithm.learners.values()]
+        assert gammas == [0.5, 0.5]
+        returns = batch["next", "option_return"]
+        ends = batch["next", "subgoal_reached"] & (batch["next", "option_steps"] > 1)
+        assert ends.any() and (returns[ends] < 1.0).all()
+        algorithm, batch = self.steps(gamma=0.5, smdp_discount=False)
+        returns, steps = batch["next", "option_return"], batch["next", "option_steps"]
+        assert ((returns * 100).round() == returns * 100).all() and (returns[steps > 1] >= 1.0).any()
+
+    @pytest.mark.parametrize(("name", "levels"), [("dqn", 1), ("drqn", 1), ("hdqn", 2), ("v1", 2), ("v2", 2)])
+    @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
+    def test_longer_targets_at_every_level(self, name, levels, settings):
+        algorithm, batch = self.steps(name=name, settings=tiny_settings(batch_size=64, **settings))
+        default, _ = self.steps(name=name)
+        assert len(algorithm.learners) == levels
+        for level, learner in algorithm.learners.items():
+            learner.store(batch)
+            sample = learner.sample()
+            assert sample.shape[1] == 4 + 1  # one step for the target of the last one that is trained
+            changed, usual = learner.loss(sample), default.learners[level].loss(sample[:, :4])
+            torch.testing.assert_close(changed["q_value"], usual["q_value"])  # the same steps are trained
+            assert changed["target"] != usual["target"]
+
+    @pytest.mark.parametrize(("name", "burns"), [("dqn", False), ("hdqn", False), ("drqn", True), ("v1", True)])
+    def test_only_what_has_a_memory_burns_in(self, name, burns):
+        """Without one, all steps of a sequence are trained that have a target."""
+        algorithm, batch = self.steps(name=name, settings=tiny_settings(batch_size=256))
+        for learner in algorithm.learners.values():
+            learner.store(batch)
+            sample = learner.sample()
+            real = sample.get(("collector", "mask"), torch.ones(sample.shape, dtype=torch.bool))
+            done, ended = (sample["next", key].squeeze(-1) for key in learner_ends(learner))
+            cut = (done & ~ended)[:, :-1] & real[:, 1:]
+            everything = real.sum() - cut.sum()
+            assert (learner.loss(sample)["trained_steps"] < everything) == burns
+
+    @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
+    def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):
+        algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount, settings=unbounded())
+        meta = algorithm.learners["meta"]
+        options = meta.extract(batch)[None, :1]
+        options["next", "terminated"].fill_(False)
+        options["is_init"].fill_(True)
+        options["next", "option_steps"].fill_(3)
+        options["next", "option_return"].fill_(0.25)
+        value_everything_at(meta, 8.0)
+        assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
+
+    def test_for_the_sub_controller_a_reached_subgoal_is_the_end_and_a_time_limit_is_not(self):
+        algorithm, batch = self.steps(gamma=0.5, max_option_steps=2, settings=unbounded())
+        sub, after = algorithm.learners["sub"], batch["next"]
+        value_everything_at(sub, 8.0)
+        reached = after["subgoal_reached"] & ~after["terminated"]
+        timed_out = after["option_done"] & ~after["subgoal_reached"] & ~after["terminated"]
+        for rows, following in ((reached, 0.0), (timed_out, 0.5 * 8.0)):
+            steps = sub.extract(batch)[rows.squeeze(-1)].unsqueeze(1)
+            steps["option_init"].fill_(True)
+            wanted = steps["next", "intrinsic_reward"].mean().item() + following
+            assert len(steps) and sub.loss(steps)["target"].item() == pytest.approx(wanted, abs=1e-5)
+
+    def test_in_mid_sequence_a_time_limit_is_left_out_and_the_next_option_restarts(self):
+        algorithm, batch = self.steps(max_option_steps=2)
+        sub = algorithm.learners["sub"]
+        steps = sub.extract(batch)[:, :4]
+        no_end = (~steps["next", "done"][:, :3].any(1) & ~steps["next", "option_terminated"].any(1)).squeeze(-1)
+        steps = steps[no_end]  # two options of two steps each
+        assert len(steps) and steps["next", "option_done"][:, 1].all()
+        assert sub.loss(steps)["trained_steps"] == 3 * len(steps)
+
+    @pytest.mark.parametrize(("mask_reached", "following"), [(True, 2.0), (False, 8.0)])
+    def test_a_subgoal_that_is_gone_has_no_part_in_the_meta_target(self, mask_reached, following):
+        algorithm, batch = self.steps(mask_reached=mask_reached, smdp_discount=False, gamma=0.5, settings=unbounded())
+        meta = algorithm.learners["meta"]
+        options = meta.extract(batch)[:, None]
+        options = options[~options["next", "terminated"].flatten()]
+        options["is_init"].fill_(True)
+        if mask_reached:
+            options["next", "subgoal_mask"] = torch.tensor([False, True]).expand(len(options), 1, 2)
+        value_everything_at(meta, 5.0)
+        with torch.no_grad():  # Q = V + A - mean(A): 5 + 3 and 5 - 3
+            meta.loss.target_value_network_params["network", "head", "streams", "bias"][1] = 6.0
+            meta.network.network.head.streams.weight.zero_()
+            meta.network.network.head.streams.bias.copy_(torch.tensor([0.0, 1.0, 0.0]))  # prefers subgoal 0
+        wanted = options["next", "option_return"].mean().item() + 0.5 * following
+        assert meta.loss(options)["target"].item() == pytest.approx(wanted)
+
+    def test_mask_reached(self):
+        for mask_reached in (True, False):
+            _, batch = self.steps(batches=3, mask_reached=mask_reached)
+            starts = batch["option_init"].squeeze(-1)
+            allowed = batch["subgoal_mask"].gather(-1, batch["subgoal"].unsqueeze(-1))[starts]
+            assert allowed.all() == mask_reached
+
+    def test_repeatable_subgoals(self):
+        for repeatable in (True, False):
+            _, batch = self.steps(repeatable_subgoals=repeatable)
+            assert batch["subgoal_mask"].all() == repeatable
+
+    def test_rewards(self):
+        _, batch = self.steps(batches=3)
+        assert batch["next", "intrinsic_reward"].unique().tolist() == [-1.0, 0.0, 1.0]
+        _, batch = self.steps(batches=3, hazard_reward=-0.25, wrong_subgoal_reward=-0.5)
+        assert batch["next", "intrinsic_reward"].unique().tolist() == [-0.5, -0.25, 0.0, 1.0]
+
+    def test_max_option_steps(self):
+        for limit in (None, 3):
+            _, batch = self.steps(max_option_steps=limit)
+            assert batch["next", "option_steps"].max() == (limit or 7)
+
+    @pytest.mark.parametrize(
+        ("options", "entries"),
+        [
+            ({"version": "v1"}, {"observation"}),
+            ({}, {"sub_hidden"}),
+            ({"meta_input": "cell"}, {"sub_cell"}),
+            ({"meta_input": "both"}, {"sub_hidden", "sub_cell"}),
+        ],
+        ids=str,
+    )
+    def test_version_and_meta_input(self, options, entries):
+        options = dict(options)
+        algorithm, batch = self.steps(name=options.pop("version", "v2"), **options)
+        stored = algorithm.learners["meta"].extract(batch)
+        assert entries == {"observation", "sub_hidden", "sub_cell"} & set(stored.keys())
+
+    def test_meta_input_time(self):
+        policies = [
+            build("v2", small_env(2), meta_input_time=time).policy
+            for time in ("after_last_decision", "after_last_observation")
+        ]
+        assert [policy.read_last_observation for policy in policies] == [False, True]
+
+    def test_settings_and_schedules_reach_their_level(self):
+        sub, meta = tiny_settings(slice_len=3), tiny_settings(slice_len=2)
+        schedules = EpsilonGreedy(0.5, 0.5), EpsilonGreedy(0.25, 0.25)
+        algorithm = make_hdrqn(
+            small_env(2),
+            NETWORKS["compact"],
+            sub=sub,
+            meta=meta,
+            sub_exploration=schedules[0],
+            meta_exploration=schedules[1],
+        )
+        assert algorithm.learners["sub"].settings is sub and algorithm.learners["meta"].settings is meta
+        policy = algorithm.policy
+        assert policy.sub_controller.exploration is algorithm.explorations["sub"] is schedules[0]
+        assert policy.meta_controller.exploration is algorithm.explorations["meta"] is schedules[1]
+
+    def test_flat_agents_learn_from_the_total_reward(self):
+        algorithm, batch = self.steps(name="drqn")
+        stored = algorithm.learners["flat"].extract(batch)
+        assert (stored["next", "reward"] == batch["next", "reward"]).all()
+        assert (batch["next", "reward"] == -1).any()
+
+    def test_sub_and_meta_learn_from_their_own_rewards(self):
+        algorithm, batch = self.steps()
+        sub, meta = (algorithm.learners[level].extract(batch) for level in ("sub", "meta"))
+        assert (sub["next", "intrinsic_reward"] == batch["next", "intrinsic_reward"]).all()
+        assert not any("reward" in stored["next"] for stored in (sub, meta))
+        assert meta["next", "option_return"].min() >= 0  # obstacles are no business of the meta-controller
+
+    @pytest.mark.parametrize(
+        ("make", "options", "message"),
+        [
+            (make_hdrqn, {"version": "v9"}, "version must be 'v1' or 'v2', got 'v9'; "),
+            (make_hdrqn, {"version": "v2", "recurrent": False}, "version='v2' needs recurrent=True.*; "),
+            (make_hdrqn, {"meta_input": "all"}, "meta_input must be one of .*, got 'all'; "),
+            (make_hdrqn, {"meta_input_time": "never"}, "meta_input_time must be .*, got 'never'; "),
+            (make_hdqn, {"gamma": 2.0}, r"gamma must lie in \[0, 1\], got 2.0; "),
+        ],
+    )
+    def test_wrong_values(self, make, options, message):
+        with pytest.raises(ValueError, match=message):
+            make(small_env(2), NETWORKS["compact"], **options)
+
+
+def test_short_options_and_short_episodes_are_trained():
+    """One to three options an episode, slices of eight: most of the meta-controller's sequences are padding."""
+    torch.manual_seed(0)
+    env = small_env(8)
+    algorithm = build("v2", env, settings=tiny_settings(slice_len=8, batch_size=16))
+    meta = algorithm.learners["meta"]
+    for batch in collect(algorithm, env, 20, batches=2):
+        meta.store(batch)
+    sample = meta.sample()
+    real = sample["collector", "mask"]
+    assert real.sum(-1).max() <= 4
+    starts = sample["is_init"][:, 0, 0]
+    result = meta.loss(sample)
+    assert result["loss"] > 0
+    assert result["trained_steps"] >= real[starts].sum() > 0
+
+
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_two_algorithms_share_nothing(name):
+    first, second = (build(name, small_env(2)) for _ in range(2))
+    ids = [{id(t) for t in [*a.policy.parameters(), *a.policy.buffers()]} for a in (first, second)]
+    assert not ids[0] & ids[1]
+    for one, other in zip(first.learners.values(), second.learners.values(), strict=True):
+        assert one.buffer is not other.buffer
+
+
+V2_STATES = ("sub_hidden", "meta_hidden")
+V3_STATES = ("memory_hidden", "memory_cell", "previous_action", "repeated_action")
+
+
+@pytest.mark.parametrize(("name", "states"), [("v2", V2_STATES), ("v3", V3_STATES)])
+def test_a_collector_carries_options_and_states_from_batch_to_batch(name, states):
+    torch.manual_seed(0)
+    env = small_env(4)
+    collector = make_collector(build(name, env), env, 3)
+    first, second = (batch.clone() for batch, _ in zip(collector, range(2), strict=False))
+    collector.shutdown()
+    going_on = ~first["next", "done"][:, -1].squeeze(-1)
+    assert going_on.any()
+    for key in (*states, "option_return", "option_steps", "active_subgoal", "option_init"):
+        assert (second[key][:, 0] == first["next", key][:, -1])[going_on].all(), key
+
+
+FLAT = [{"sampling": sampling} for sampling in ("steps", "episodes", "episode_starts", "whole_episodes")]
+PRIORITISED = [{**settings, "priority_exponent": 0.9} for settings in FLAT if settings["sampling"] != "episodes"]
+STARTS = [settings for settings in FLAT + PRIORITISED if settings["sampling"] in FROM_STARTS]
+STORED = [{**settings, "stored_state": True} for settings in FLAT + PRIORITISED if settings not in STARTS]
+OPTIONS = [settings for settings in FLAT + PRIORITISED + STORED if settings["sampling"] != "episode_starts"]
+
+
+@cache
+def played(make):
+    """Batches of an algorithm that is made by ``make``."""
+    torch.manual_seed(0)
+    env = small_env(8)
+    return collect(make(env, NETWORKS["compact"]), env, 10, batches=3)
+
+
+class TestSequences:
+    """Every way to draw sequences, with every level that takes it."""
+
+    @pytest.mark.parametrize("settings", FLAT + PRIORITISED + STORED, ids=str)
+    @pytest.mark.parametrize(("make", "level"), [(make_drqn, "learner"), (make_hdrqn, "sub")], ids=["drqn", "v2"])
+    def test_of_steps(self, make, level, settings):
+        self.check(make, level, settings)
+
+    @pytest.mark.parametrize("settings", OPTIONS, ids=str)
+    def test_of_options(self, settings):
+        self.check(make_hdrqn, "meta", settings)
+
+    @pytest.mark.parametrize("settings", STARTS + STORED, ids=str)
+    def test_of_v3(self, settings):
+        self.check(make_v3, "learner", settings)
+
+    def check(self, make, level, settings):
+        settings, env = tiny_settings(batch_size=16, **settings), small_env(8)
+        algorithm = make(env, NETWORKS["compact"], **{level: settings})
+        learner = algorithm.learners["meta" if level == "meta" else next(iter(algorithm.learners))]
+        for batch in played(make):
+            learner.store(batch)
+        metrics = learner.update(learner.sample())
+        assert metrics["trained_steps"] > 0 and all(torch.isfinite(value) for value in metrics.values())
+        sample = learner.sample()
+        assert sample["is_init"][:, 0].all() if settings.sampling in FROM_STARTS else len(sample) == 16
+        assert ("priority_weight" in sample) == (settings.priority_exponent is not None)
+
+
+STATES = {
+    ("drqn", "flat"): ["sub_hidden", "sub_cell"],
+    ("v1", "sub"): ["sub_hidden", "sub_cell"],
+    ("v1", "meta"): ["meta_hidden", "meta_cell"],
+    ("v2", "sub"): ["sub_hidden", "sub_cell"],
+    ("v2", "meta"): ["meta_hidden", "meta_cell"],
+    ("v3", "joint"): ["memory_hidden", "memory_cell"],
+}
+
+
+class TestStoredStates:
+    @pytest.mark.parametrize(("name", "level"), STATES)
+    @pytest.mark.parametrize("stored_state", [False, True])
+    def test_they_are_stored_and_learned_from_only_if_asked_for(self, name, level, stored_state):
+        torch.manual_seed(0)
+        env = small_env(8)
+        options = {} if name == "drqn" else {"max_option_steps": 3}
+        settings = tiny_settings(stored_state=stored_state, batch_size=64, slice_len=2, burn_in=0.0)
+        algorithm = build(name, env, NETWORKS["compact"], settings=settings, **options)
+        learner = algorithm.learners[level]
+        learner.store(collect(algorithm, env, 30)[0])
+        sample = learner.sample()
+        for key in STATES[name, level]:
+            assert (key in sample) == stored_state
+        before = learner.update(sample.clone())
+        assert all(torch.isfinite(value) for value in before.values())
+        if stored_state:
+            before = learner.loss(sample)["loss"]
+            sample[STATES[name, level][0]][:, 0] += 1.0
+            assert learner.loss(sample)["loss"] != before
+
+    @pytest.mark.parametrize("name", ["dqn", "hdqn"])
+    def test_a_network_without_any_is_refused(self, name):
+        with pytest.raises(ValueError, match="stored_state must be False without recurrence, got True; "):
+            build(name, small_env(2), settings=tiny_settings(stored_state=True))
+
+
+class TestV3:
+    def make(self, env=None, *, learner=None, **options):
+        torch.manual_seed(0)
+        settings = tiny_settings(**({"sampling": "episode_starts", "batch_size": 16} | (learner or {})))
+        return make_v3(env or small_env(8), NETWORKS["compact"], learner=settings, **options)
+
+    def steps(self, **options):
+        env = small_env(8)
+        algorithm = self.make(env, **options)
+        return algorithm, collect(algorithm, env, 40)[0]
+
+    def test_one_update_moves_every_part_and_the_target_follows(self):
+        algorithm, batch = self.steps(learner={"tau": 0.25, "learning_rate": 0.1})
+        learner, network = algorithm.learners["joint"], algorithm.policy.network
+        learner.store(batch)
+        before = {name: p.detach().clone() for name, p in network.named_parameters()}
+        metrics = learner.update(learner.sample())
+        target = learner.loss.target_policy_params["network"].flatten_keys(".")
+        for name, parameter in network.named_parameters():
+            moved = (parameter - before[name]).abs().max().item()
+            assert moved > 0 or name.startswith("memory.bias_hh"), name
+            torch.testing.assert_close(target[name], before[name].lerp(parameter.detach(), 0.25), msg=name)
+        assert not any(value.requires_grad for value in metrics.values())
+        assert set(metrics) == set(learner.loss.out_keys) - {"priority"}
+
+    def test_a_sequence_has_one_step_more_than_are_trained(self):
+        algorithm, batch = self.steps(learner={"slice_len": 5, "batch_size": 3})
+        learner = algorithm.learners["joint"]
+        learner.store(batch)
+        assert learner.sample().shape == (3, 6)
+
+    def test_what_is_stored(self):
+        """Nothing twice: no next observation, no recurrent state."""
+        algorithm, batch = self.steps()
+        stored = algorithm.learners["joint"].extract(batch)
+        ends = {("next", key) for key in ("done", "terminated", "truncated")} | {("collector", "traj_ids")}
+        assert set(stored.keys(True, True)) == ends | {
+            "observation",
+            "previous_action",
+            "action",
+            "is_init",
+            "option_init",
+            "subgoal_mask",
+            ("next", "attained"),
+            ("next", "hazard"),
+            ("next", "extrinsic_reward"),
+            ("next", "active_subgoal"),
+        }
+        assert all((stored[key] == batch[key]).all() for key in stored.keys(True, True))
+
+    @pytest.mark.parametrize(
+        ("name", "value"),
+        [
+            ("sub_gamma", 0.5),
+            ("meta_gamma", 0.5),
+            ("trace_decay", 0.25),
+            ("all_subgoals", False),
+            ("intra_option", False),
+            ("wrong_subgoal_reward", -0.25),
+            ("hazard_reward", -0.75),
+            ("max_meta_target", 1.5),
+        ],
+    )
+    def test_options_of_the_loss(self, name, value):
+        default, changed = (self.make(**options).learners["joint"].loss for options in ({}, {name: value}))
+        assert getattr(default, name) != getattr(changed, name) == value
+
+    def test_double(self):
+        for double in (True, False):
+            assert self.make(learner={"double": double}).learners["joint"].loss.double == double
+
+    def test_options_of_the_network(self):
+        algorithm = self.make(memory_size=9, head_size=7, joint=False)
+        network = algorithm.policy.network
+        assert (network.hidden_size, network.sub_head[0].out_features, network.joint) == (9, 7, False)
+        assert self.make().policy.network.joint
+        assert (network.num_actions, network.num_subgoals) == (4, 2)
+
+    def test_rewards_and_discount_reach_the_option_book(self):
+        _, batch = self.steps(wrong_subgoal_reward=-0.25, hazard_reward=-0.75, meta_gamma=0.5)
+        assert batch["next", "intrinsic_reward"].unique().tolist() == [-0.75, -0.25, 0.0, 1.0]
+        steps, option_return = batch["next", "option_steps"], batch["next", "option_return"]
+        late = batch["next", "subgoal_reached"] & (steps > 1)
+        assert (option_return == 0.5 ** (steps - 1))[late].any()  # a goal in order
+
+    def test_max_option_steps(self):
+        for limit in (None, 3):
+            _, batch = self.steps(max_option_steps=limit)
+            assert batch["next", "option_steps"].max() == (limit or 7)
+
+    def test_schedules_reach_their_level(self):
+        sub, meta = RepeatingEpsilonGreedy(0.5, 0.5), EpsilonGreedy(0.25, 0.25)
+        algorithm = self.make(sub_exploration=sub, meta_exploration=meta)
+        assert algorithm.policy.sub_exploration is algorithm.explorations["sub"] is sub
+        assert algorithm.policy.meta_exploration is algorithm.explorations["meta"] is meta
+        default = self.make()
+        assert isinstance(default.explorations["sub"], RepeatingEpsilonGreedy)
+        assert not isinstance(default.explorations["meta"], RepeatingEpsilonGreedy)
+        assert default.explorations["sub"] is not self.make().explorations["sub"]
+
+    def test_single_random_steps_need_nothing_carried(self):
+        _, batch = self.steps(sub_exploration=EpsilonGreedy(0.5, 0.5))
+        assert "repeated_action" not in batch and "repeated_action" not in batch["next"]
+
+    @pytest.mark.parametrize("sampling", ["steps", "episodes"])
+    def test_sampling_in_mid_episode_is_refused(self, sampling):
+        with pytest.raises(
+            ValueError, match=rf"sampling must be one of \(.*\) for v3 without stored_state, got '{sampling}': "
+        ):
+            self.make(learner={"sampling": sampling})
+
+    def test_whole_episodes_teach_what_sequences_that_run_on_do(self):
+        """Cut off behind their first episode, sequences that run on are those that are padded there."""
+        algorithm, batch = self.steps(prediction_steps=0, learner={"slice_len": 7, "batch_size": 64})
+        learner, losses = algorithm.learners["joint"], {}
+        for sampling in ("episode_starts", "whole_episodes"):
+            settings = {"slice_len": 8, "batch_size": 512, "num_envs": 8, "sampling": sampling}
+            buffer = make_sequence_buffer(2_000, **settings)
+            buffer.extend(learner.extract(batch))
+            sample = sample_sequences(buffer, 8)
+            if sampling == "episode_starts":
+                sample["collector", "mask"] = sample["is_init"].squeeze(-1).cumsum(-1) == 1
+            rows = {row["collector", "traj_ids"][0, 0].item(): row for row in sample.split(1)}
+            for traj, row in sorted(rows.items())[:40]:
+                losses.setdefault(traj, {})[sampling] = learner.loss(row)["loss"]
+        both = [tuple(found.values()) for found in losses.values() if len(found) == 2]
+        assert len(both) > 20 and sum(first > 0 for first, _ in both) > 20
+        for first, second in both:
+            torch.testing.assert_close(first, second)
+
+    def test_a_meta_level_that_only_reads_the_memory_has_its_own_optimiser(self):
+        learner = self.make(joint=False, meta_learning_rate=1e-4, learner={"learning_rate": 1e-3}).learners["joint"]
+        rest, head = learner.optimizer.param_groups
+        assert (rest["lr"], head["lr"]) == pytest.approx((1e-3, 1e-4))
+        assert {id(p) for p in head["params"]} == {id(p) for p in learner.network.network.meta_head.parameters()}
+        with pytest.raises(ValueError, match=r"meta_learning_rate must be None with joint=True, got 0\.1"):
+            self.make(meta_learning_rate=0.1)
+
+    def test_settings_of_the_loss_reach_it(self):
+        changes = {"burn_in": 0.25, "loss_function": "smooth_l1", "double": False}
+        loss = self.make(learner=changes).learners["joint"].loss
+        assert {name: getattr(loss, name) for name in changes} == changes
+        loss = self.make(learner={"burn_in": 0.0, "train_exact_states": False}).learners["joint"].loss
+        assert not loss.train_exact_states
+
+    def test_one_bound_for_both_levels_is_refused(self):
+        with pytest.raises(ValueError, match=r"max_target must be None for v3, got 1.0; .* by max_meta_target"):
+            self.make(learner={"max_target": 1.0})
+
+    @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
+    def test_targets_of_the_learner_are_refused(self, settings):
+        with pytest.raises(
+            ValueError, match=r"trace_decay and n_step must be left at 0 and 1 for v3, got .*; its loss"
+        ):
+            self.make(learner=settings)
+
+    def test_the_default_learner(self):
+        assert V3_LEARNER.sampling == "episode_starts"
+        algorithm = make_v3(small_env(2), NETWORKS["compact"])
+        assert algorithm.learners["joint"].settings == replace(V3_LEARNER, slice_len=7)  # the steps of an episode
+
+    def test_a_restored_learner_goes_on_alike(self):
+        algorithm, batch = self.steps()
+        first, second = algorithm.learners["joint"], self.make().learners["joint"]
+        first.store(batch[:, :20])
+        second.store(batch[:, 20:])
+        for learner in (first, second):
+            learner.update(learner.sample())
+        second.load_state_dict(deepcopy(first.state_dict()))  # torch's optimiser keeps what it is given
+        for learner in (first, second):
+            torch.manual_seed(1)
+            learner.store(batch[:, 20:])
+            for _ in range(2):
+                learner.update(learner.sample())
+        assert parameter_distance(first.loss.policy_params.data, second.loss.policy_params.data) == 0
+        assert parameter_distance(first.loss.target_policy_params, second.loss.target_policy_params) == 0
+
+
+class TestRepeatedActions:
+    """Temporally extended epsilon-greedy is not v3's alone."""
+
+    @pytest.mark.parametrize("name", ["drqn", "dqn", "v1", "v2", "hdqn"])
+    def test_random_stretches_last_over_steps_but_not_over_episodes(self, name):
+        torch.manual_seed(0)
+        env = small_env(32, max_steps=20, num_goals=2)
+        always = RepeatingEpsilonGreedy(1.0, 1.0, exponent=0.01, max_repeats=10)
+        place = "exploration" if name in ("drqn", "dqn") else "sub_exploration"
+        algorithm = build(name, env, **{place: always})
+        steps = collect(algorithm, env, 60)[0]
+        left, action = steps["repeated_action"][..., 1], steps["action"]
+        assert not left[steps["is_init"].squeeze(-1)].any()
+        starts = steps["is_init" if name in ("drqn", "dqn") else "option_init"].squeeze(-1)
+        goes_on = (left[:, 1:] > 0) & ~starts[:, 1:]
+        assert goes_on.float().mean() > 0.6
+        assert (action[:, 1:] == action[:, :-1])[goes_on].all()
+        for learner in algorithm.learners.values():
+            learner.store(steps)
+        assert torch.isfinite(learner.update(learner.sample())["loss"])
+
+    @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
+    def test_nor_over_options(self, name):
+        """Only every second option explores here: it must not pass its stretch on."""
+        torch.manual_seed(0)
+        env = small_env(16, max_steps=30, num_goals=2)
+        exploration = SuccessEpsilonGreedy(1.0, 0.0, max_repeats=15, exponent=0.01)
+        algorithm = build(name, env, sub_exploration=exploration, max_option_steps=3)
+        exploration.success.rates.copy_(torch.tensor([0.0, 1.0]))  # the second subgoal needs no exploring
+        actions, greedy = [], []
+        choose = exploration.extend
+
+        def listen(values, *others):
+            greedy.append(values.argmax(-1))
+            actions.append(choose(values, *others))
+            return actions[-1]
+
+        exploration.extend = listen
+        with set_exploration_type(ExplorationType.RANDOM):
+            steps = algorithm.transform(env).rollout(40, algorithm.policy, break_when_any_done=False)
+        mastered = steps["subgoal"] == 1
+        taken, best = steps["action"], torch.stack(greedy, 1)
+        assert (taken == best)[mastered].all() and not (taken == best)[~mastered].all()
+        assert not steps["next", "repeated_action"][mastered][:, 1].any()
+        starts = steps["option_init"].squeeze(-1)
+        assert (steps["repeated_action"][..., 1] > 0)[starts & mastered].any()  # there was something to drop
+
+    @pytest.mark.parametrize("kind", [RepeatingEpsilonGreedy, SuccessEpsilonGreedy])
+    @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
+    def test_subgoals_are_not_repeated(self, name, kind):
+        with pytest.raises(ValueError, match=f"exploration must be an EpsilonGreedy .* got {kind.__name__}: .*; use"):
+            build(name, small_env(), meta_exploration=kind())
+
+    @pytest.mark.parametrize("name", ["dqn", "drqn"])
+    def test_flat_agents_have_no_success_of_subgoals_to_go_by(self, name):
+        with pytest.raises(ValueError, match="exploration must not be a SuccessEpsilonGreedy without subgoals"):
+            build(name, small_env(), exploration=SuccessEpsilonGreedy())
+
+    def test_a_greedy_policy_does_not_repeat(self):
+        env = small_env(4)
+        algorithm = build("v2", env, sub_exploration=RepeatingEpsilonGreedy(1.0, 1.0))
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            steps = algorithm.transform(env).rollout(6, algorithm.policy, break_when_any_done=False)
+        assert not steps["repeated_action"].any()
+
+
+def test_bounds_of_targets_in_the_settings_that_come_with_the_project():
+    found = {}
+    with initialize_config_dir(str(configuration.CONF), version_base="1.3"):
+        for experiment in (None, "as_in_paper"):
+            chosen = [] if experiment is None else [f"experiment={experiment}"]
+            config = compose("config", overrides=["algo=v2", "env.num_envs=2", "env.num_goals=3", *chosen])
+            learners = build_algorithm(config)[1].learners
+            found[experiment] = [learners[level].loss.max_target for level in ("sub", "meta")]
+    assert found == {None: [1.0, 3.0], "as_in_paper": [math.inf, math.inf]}

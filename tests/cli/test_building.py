@@ -1,0 +1,56 @@
+"""What may be built, where, and how large."""
+
+import pytest
+
+from hdrqn_torchrl.cli.building import BUILDERS, SettingsError, build, check_sizes
+
+GRID = {"_target_": "hdrqn_torchrl.envs.MultiGoalGridEnv"}
+LEARNER = {"_target_": "hdrqn_torchrl.learning.LearnerSettings"}
+V2 = {"_target_": "hdrqn_torchrl.algorithms.make_hdrqn"}
+NET = {"_target_": "hdrqn_torchrl.modules.compact_network"}
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        (GRID | {"num_envs": 10**9}, r"num_envs must be <= 100,000, got 1000000000; use less\."),
+        (GRID | {"max_steps": 10**9}, r"max_steps must be <= 1,000,000, "),
+        (V2 | {"prediction_steps": 10**9}, r"prediction_steps must be <= 64, "),
+        (V2 | {"sub": LEARNER | {"capacity": 10**12}}, r"sub\.capacity must be <= 20,000,000, "),
+        (NET | {"hidden_size": 10**5}, r"hidden_size must be <= 2,048, "),
+        (NET | {"widths": [8, 10**5]}, r"widths must be <= 2,048, "),
+        (NET | {"widths": [8] * 100}, r"widths must have at most 64 values, got 100\."),
+        (LEARNER | {"warmup_frames": 10**400}, r"warmup_frames must be <= "),
+        (LEARNER | {"warmup_frames": -(10**400)}, r"warmup_frames must be <= "),
+    ],
+    ids=lambda value: str(value)[:60],
+)
+def test_a_size_beyond_all_measure_is_told_with_its_rule(settings, told):
+    with pytest.raises(SettingsError, match=f"^part\\.{told}") as refusal:
+        check_sizes(settings, "part")
+    assert str(refusal.value).endswith(".") and "\n" not in str(refusal.value)
+
+
+def test_types_are_checked_as_well():
+    with pytest.raises(ValueError, match=r"^env\.view must be an integer or null, got 'abc'; "):
+        build(GRID | {"view": "abc"}, place="env")
+
+
+@pytest.mark.parametrize("place", ["env", "network", "algo", "logger.loggers[0]"])
+def test_a_builder_stands_in_its_own_place_only(place):
+    elsewhere = [
+        target for name, targets in BUILDERS.items() if name.partition("[")[0] not in place for target in targets
+    ]
+    for target in elsewhere:
+        with pytest.raises(SettingsError, match="must be one of the builders that this program trusts there"):
+            build({"_target_": target}, place=place)
+
+
+@pytest.mark.parametrize("settings", [None, 3, [], {}, {"num_envs": 3}, [GRID]], ids=str)
+def test_nothing_is_built_without_a_name(settings):
+    with pytest.raises(SettingsError, match=r"^env must be settings with a _target_, got "):
+        build(settings, place="env")
+
+
+def test_an_environment():
+    assert build(GRID | {"num_envs": 3, "view": None}, place="env").num_envs == 3

@@ -1,0 +1,135 @@
+"""evaluate.py on a run of train.py."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from processes import ROOT
+from programs import TINY, TINY_HDRQN
+
+from hdrqn_torchrl.cli import evaluate
+from hdrqn_torchrl.cli.configuration import command_line
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, *TINY_HDRQN, "logger=csv", "hydra.run.dir=run"]
+    subprocess.run(command, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True, capture_output=True)
+    return folder / "run"
+
+
+@pytest.fixture
+def call(run, monkeypatch, capsys):
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["evaluate.py", f"run={run}", *arguments])
+        command_line(evaluate.Settings, evaluate.__doc__, evaluate.run)
+        return json.loads(capsys.readouterr().out)
+
+    return call
+
+
+def test_it_finds_what_the_run_found_at_its_end(run, call):
+    """The last checkpoint, played in the same worlds as the run's final evaluation."""
+    result = call("checkpoint=last", "episodes=8", "num_envs=8")
+    summary = json.loads((run / "summary.json").read_text())
+    for name in ("return_mean", "intrinsic_mean", "success_rate", "steps_mean", "episodes", "ceiling"):
+        assert result[name] == summary[name], name
+    assert result["seed"] == 1_000_001  # not the 1_000_000 of the evaluations that chose the best checkpoint
+
+
+def test_what_it_says(call):
+    result = call("episodes=32", "num_envs=16")
+    assert result["episodes"] == 32 and result["epsilon"] == 0.0 and result["env"]["max_steps"] == 10
+    for name, interval in result["intervals"].items():
+        assert interval is None or interval[0] <= result[name] <= interval[1], name
+    assert result["intervals"]["success_rate"] and result["intervals"]["intrinsic_mean"]
+    assert len(result["per_subgoal"]) == 2 and all(0 <= each["attained"] <= 1 for each in result["per_subgoal"])
+    assert result["references"]["memory"]["return_mean"] == result["ceiling"]
+
+
+def test_a_seed_repeats_and_another_differs(call):
+    first, again, other = (call("episodes=64", f"seed={seed}") for seed in (1, 1, 2))
+    assert first == again
+    assert first["return_mean"] != other["return_mean"]
+
+
+def test_epsilon_and_the_task_can_be_changed(call):
+    greedy, random = call("episodes=64"), call("episodes=64", "epsilon=1")
+    assert greedy["return_mean"] != random["return_mean"]
+    longer = call("episodes=64", "epsilon=1", "env.max_steps=40")
+    assert longer["steps_mean"] > 10 >= random["steps_mean"]
+    assert longer["ceiling"] > random["ceiling"]
+
+
+def test_legs_and_their_picture(call, tmp_path):
+    result = call("episodes=32", "num_envs=16", "epsilon=0.5", f"figures={tmp_path}/figures")
+    options, reached = result["legs"]["options"], result["legs"]["reached"]
+    assert len(options) == 3 and all(
+        len(row) == 2 for row in options
+    )  # from each goal and from the start, to each goal
+    assert sum(map(sum, options)) >= 32
+    assert all(r <= o for row, told in zip(reached, options, strict=True) for r, o in zip(row, told, strict=True))
+    assert [path.name for path in (tmp_path / "figures").iterdir()] == ["legs.png"]
+
+
+def test_the_object_can_be_written_to_a_file(call, tmp_path):
+    result = call("episodes=8", f"out={tmp_path / 'new' / 'result.json'}")
+    assert json.loads((tmp_path / "new" / "result.json").read_text()) == result
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["episodes=0"], "episodes must be >= 1, got 0"),
+        (["num_envs=0"], "num_envs must be >= 1, got 0"),
+        (["seed=-1"], "seed must be >= 0, got -1"),
+        (["epsilon=2"], r"epsilon must lie in \[0, 1\], got 2"),
+        (["episods=3"], "episods"),
+        (["env.veiw=3"], "env.veiw must be one of"),
+        (["env._target_=os.system"], "env._target_ must be one of"),
+        (["env.view=4"], "env.view must be an odd number"),
+        (
+            ["env.num_goals=3"],
+            r"env.num_goals=3 must leave .*, but .*, attained is bool \[3\] instead of",
+        ),
+        (
+            ["env.view=3"],
+            r"env.view=3 must leave .*, but observation is uint8 \[3, 3\] below 5 instead",
+        ),
+        (["checkpoint=nowhere"], "nowhere"),
+        (["run=nowhere"], "run must be a folder that train.py wrote, got nowhere"),
+        (["episodes=8", "out=/dev/null/result.json"], "out must be a file that can be written"),
+        (["episodes=8", "figures=/dev/null/figures"], "figures must be a file that can be written"),
+        (["episodes"], "must read key=value, got 'episodes'"),
+    ],
+)
+def test_wrong_arguments_are_told(call, arguments, part):
+    with pytest.raises(SystemExit, match=part):
+        call(*arguments)
+
+
+def test_results_come_before_figures_and_survive_them(run, monkeypatch, capsys, tmp_path):
+    def fail(*_):
+        raise OSError("no room")
+
+    monkeypatch.setattr(evaluate, "draw", fail)
+    arguments = [f"run={run}", "episodes=8", "ceilings=false", f"figures={tmp_path / 'a #b'}", f"out={tmp_path}/1.json"]
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", *arguments])
+    with pytest.raises(SystemExit, match=r"error: out and figures must be .* \(no room\)"):
+        command_line(evaluate.Settings, evaluate.__doc__, evaluate.run)
+    result = json.loads(capsys.readouterr().out)
+    assert result["episodes"] == 8 and json.loads((tmp_path / "1.json").read_text()) == result
+    assert result["ceiling"] is None and result["references"] == {}
+
+
+def test_help_and_missing_arguments(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        command_line(evaluate.Settings, evaluate.__doc__, evaluate.run)
+    assert stop.value.code == 0 and "env.KEY" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["evaluate.py", "episodes=3"])
+    with pytest.raises(SystemExit, match="run must be given"):
+        command_line(evaluate.Settings, evaluate.__doc__, evaluate.run)

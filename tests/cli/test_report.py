@@ -1,0 +1,261 @@
+import json
+import re
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from hdrqn_torchrl.analysis.claims import Near
+from hdrqn_torchrl.cli import report
+from hdrqn_torchrl.cli.configuration import command_line
+from hdrqn_torchrl.cli.studies import CONF, STUDIES, Job, flat, is_run_of, jobs_of
+
+COLUMNS = (
+    "frames,episodes,updates,wall_seconds,behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/steps"
+)
+EXPERIMENTS = sorted(path.stem for path in (Path(CONF) / "experiment" / "paper").glob("*.yaml"))
+
+
+def make_run(folder, *overrides, score=1.0, finished=True):
+    """A run folder as train.py writes it."""
+    folder.mkdir(parents=True)
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = compose("config", overrides=list(overrides), return_hydra_config=True)
+    choices = {str(key): value for key, value in config.hydra.runtime.choices.items()}
+    config = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(config))
+    (folder / "run.json").write_text(json.dumps({"choices": choices, "commit": "0123456789"}))
+    rows = [f"{i * 100},{i * 7},{i * 10},{i * 60.5},{score * i},{50 - i},{score * i},{i / 4},20" for i in range(5)]
+    (folder / "metrics.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
+    if finished:
+        summary = {"return_mean": score, "success_rate": 0.75, "in_order_rate": 0.8, "steps_mean": 21.0}
+        (folder / "summary.json").write_text(json.dumps(summary | {"frames": 400, "wall_seconds": 60, "ceiling": 2.0}))
+    return folder
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path, capsys):
+    """Runs ``python report.py ARGUMENTS`` in this process and returns what it printed; errors end it with a message."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["report.py", *arguments])
+        try:
+            command_line(report.Settings, report.__doc__, report.run)
+        except SystemExit as ended:
+            return str(ended)
+        return capsys.readouterr().out
+
+    return call
+
+
+@pytest.fixture
+def outputs(tmp_path):
+    study = "experiment=gridworld"
+    for algo, score in (("v2", 1.6), ("v1", 1.2), ("dqn", 0.2)):
+        for seed in (0, 1):
+            made = f"outputs/{algo}-seed{seed}"
+            make_run(tmp_path / made, study, f"algo={algo}", f"seed={seed}", score=score + seed / 100)
+    make_run(tmp_path / "outputs/hdqn", study, "algo=hdqn", finished=False)
+    make_run(tmp_path / "outputs/other", study, "algo=v2", "algo.gamma=0.9", score=9.0)
+    return tmp_path / "outputs"
+
+
+def test_figures_tables_and_claims_of_a_study(run, outputs):
+    assert run("runs=outputs", "out=results.md", "studies=gridworld") == "gridworld: runs 7, missing 11\n"
+    text = Path("results.md").read_text()
+    assert "`python train.py -m experiment=gridworld` (runs that have not been made to their end yet: 12 of 18)" in text
+    row = next(line for line in text.splitlines() if line.startswith("| v2 |"))
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    expected = "v2", "0, 1", "1.60", "1.54 to 1.67", "", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
+    assert tuple(cells) == expected
+    assert "| hdqn | none finished |" in text
+    assert "| v2 takes 22 steps (within 1.5) | open | v2 21 |" in text
+    assert "above hdqn" not in text  # it has not finished, so nothing is claimed of it
+    for name in ("gridworld.png", "gridworld_greedy.png"):
+        assert (Path("results") / name).stat().st_size > 100
+    assert "(results/gridworld.png)" in text
+
+
+def test_claims_are_held_against_finished_runs(run, outputs):
+    for algo, score in (("hdqn", 0.8), ("drqn", 0.3)):
+        make_run(outputs / f"done-{algo}", "experiment=gridworld", f"algo={algo}", score=score)
+    run("runs=outputs", "out=results.md", "studies=gridworld")
+    text = Path("results.md").read_text()
+    assert "| v2 above v1 | agrees | v2 1.6 ± 0.0635, v1 1.21 ± 0.0635 |" in text
+    assert "| hdqn above drqn and dqn | open (one seed) | hdqn 0.8, drqn 0.3, dqn 0.205 ± 0.0635 |" in text
+    assert "claims small" not in text  # of some studies alone there is no overview
+
+
+def test_overview_of_all_claims(run, outputs):
+    run("runs=outputs", "out=results.md")
+    overview = Path("results.md").read_text().partition("<!-- claims small -->")[2]
+    assert "| study | claim (of greedy play at the end) | | measured |\n|---|---|---|---|" in overview
+    assert (
+        "| All algorithms, gridworld, two goals | v2 above v1 | agrees | v2 1.6 ± 0.0635, v1 1.21 ± 0.0635 |"
+        in overview
+    )
+
+
+def test_what_people_wrote_is_left_as_it_is(run, outputs):
+    run("runs=outputs", "out=results.md", "studies=gridworld")
+    generated = Path("results.md").read_text()
+    Path("results.md").write_text(generated.replace("# Results\n", "# Ours\n\nBefore.\n") + "\nAfter.\n")
+    run("runs=outputs", "out=results.md", "studies=gridworld")
+    assert Path("results.md").read_text() == generated.replace("# Results\n", "# Ours\n\nBefore.\n") + "\nAfter.\n"
+
+
+def test_an_archive_gives_the_same_report(run, outputs):
+    run("runs=outputs", "out=a.md", "studies=gridworld", "keep=kept/runs.tar.xz")
+    kept = Path("kept/runs.tar.xz").read_bytes()
+    run("runs=kept/runs.tar.xz", "out=b.md", "studies=gridworld", "keep=again.tar.xz")
+    assert Path("b.md").read_text() == Path("a.md").read_text().replace("(a/", "(b/")
+    assert Path("again.tar.xz").read_bytes() == kept
+    assert (Path("a") / "gridworld.png").read_bytes() == (Path("b") / "gridworld.png").read_bytes()
+
+
+def test_rows_of_a_study_and_agents_beside_it(run, tmp_path):
+    for algo in ("v1", "v2"):
+        for length in (1, 8):
+            settings = f"algo={algo}", f"algo.sub.slice_len={length}", "algo.meta.slice_len=1"
+            make_run(tmp_path / f"outputs/{algo}-{length}", "experiment=sub_sequences", *settings, score=length / 8)
+    make_run(tmp_path / "outputs/v3", "experiment=gridworld", "algo=v3")
+    assert run("runs=outputs", "out=results.md", "studies=sub_sequences") == "sub_sequences: runs 4, missing 26\n"
+    text = Path("results.md").read_text()
+    assert text.index("**v1**") < text.index("| slice_len=1 |") < text.index("| v3 |") < text.index("**v2**")
+
+
+def test_a_run_stands_for_what_a_study_calls_it(run, outputs):
+    """The variant v2 of one study is the algorithm v2 of another."""
+    make_run(outputs / "cell", "experiment=authors_choices", "variant=v2_cell")
+    assert run("runs=outputs", "out=results.md", "studies=authors_choices") == "authors_choices: runs 3, missing 15\n"
+    rows = [line.split("|")[1].strip() for line in Path("results.md").read_text().splitlines() if line[:4] == "| v2"]
+    assert rows == ["v2", "v2_cell"]
+
+
+class TestScreen:
+    """Montezuma's Revenge: score, key and door as evaluate.py measured them, and legs."""
+
+    @pytest.fixture
+    def folder(self, tmp_path):
+        folder = make_run(tmp_path / "outputs/v3", "experiment=montezuma", "algo=v3", finished=False)
+        places = [*range(6), "start"]
+        extra = {"behaviour/attained_3": 0.5, "behaviour/success": 0.25}
+        extra |= {f"behaviour/visits_{number}": number for number in range(6)}
+        extra |= {f"legs/{place}_to_{goal}": 0.75 for place in places for goal in range(6)}
+        names, *rows = (folder / "metrics.csv").read_text().splitlines()
+        added = ",".join(map(str, extra.values()))
+        (folder / "metrics.csv").write_text(
+            "\n".join([f"{names},{','.join(extra)}", *(f"{r},{added}" for r in rows), ""])
+        )
+        (folder / "evaluations").mkdir()
+        for name, epsilon, sticky in (("a", 0.05, 0.25), ("b", 0.0, 0.0)):
+            subgoals = [{"attained": 0.0}, {"attained": 0.85}]
+            env = {"subgoals": ["left_door", "key"], "sticky": sticky}
+            result = {"env": env, "epsilon": epsilon, "episodes": 100, "per_subgoal": subgoals, "return_mean": 310.2}
+            result |= {"intervals": {"return_mean": [290.4, 330.0]}, "success_rate": 0.75, "steps_mean": 190.0}
+            (folder / f"evaluations/{name}.json").write_text(json.dumps(result))
+        return folder
+
+    def test_table_and_figures(self, run, folder):
+        assert run("runs=outputs", "out=results.md", "studies=montezuma") == "montezuma: runs 1, missing 5\n"
+        text = Path("results.md").read_text()
+        rows = [line for line in text.splitlines() if line.startswith("| v3")]
+        assert rows == [
+            "| v3 | 0 | 0k | 0 | 0 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
+            "| v3 | 0 | 0k | 0.05 | 0.25 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
+        ]
+        for name in ("montezuma", "montezuma_right", "montezuma_left", "montezuma_legs_v3"):
+            assert f"(results/{name}.png)" in text and (Path("results") / f"{name}.png").stat().st_size > 100
+
+    def test_an_archive_keeps_evaluations(self, run, folder):
+        run("runs=outputs", "out=a.md", "studies=montezuma", "keep=runs.tar.xz")
+        run("runs=runs.tar.xz", "out=b.md", "studies=montezuma")
+        assert Path("b.md").read_text() == Path("a.md").read_text().replace("(a/", "(b/")
+
+
+def test_runs_of_another_size_do_not_count(run, outputs):
+    message = run("runs=outputs", "out=results.md", "studies=gridworld", "size=paper")
+    assert message == "gridworld: runs 0, missing 18\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["size=huge"], "error: size must be one of small, paper, got 'huge'."),
+        (["studies=gridword"], "error: studies must be some of .*, got 'gridword'."),
+        (["out=results.txt"], "error: out must end in .md, got 'results.txt'; "),
+        (["runs=broken.tar.xz"], "error: runs must name folders or readable archives, got broken.tar.xz: "),
+    ],
+)
+def test_wrong_settings(run, outputs, arguments, message):
+    Path("broken.tar.xz").write_text("no archive")
+    assert re.match(message, run("runs=outputs", *arguments))
+
+
+class TestStudies:
+    def test_each_experiment_of_the_paper_is_a_study(self):
+        assert sorted(study.name for study in STUDIES if "paper" in study.sizes) == EXPERIMENTS
+
+    @pytest.mark.parametrize("study", [each for each in STUDIES if "paper" in each.sizes], ids=lambda study: study.name)
+    def test_jobs_of_both_sizes(self, study):
+        small, paper = jobs_of(study.name), jobs_of(f"paper/{study.name}")
+        assert len(small) == len(paper) >= 9
+        assert all(is_run_of(job, other.settings) == (job is other) for job in small for other in small)
+        assert {job.settings["seed"] for job in small} == {0, 1, 2}
+        assert all(job.settings["network._target_"].endswith("paper_network") for job in paper)
+        assert min(job.settings["total_frames"] for job in paper) > max(job.settings["total_frames"] for job in small)
+        assert all(job.label(study.by) for job in small)
+
+    @pytest.mark.parametrize("study", [each for each in STUDIES if each.claims], ids=lambda study: study.name)
+    def test_claims_are_about_groups_that_there_are(self, study):
+        """One that names another group would never be held against anything."""
+        labels = {job.label(study.by) for job in jobs_of(study.name)}
+        rows = {job.label([study.rows]) for job in jobs_of(study.name)} if study.rows else set()
+        for claim in study.claims:
+            groups = [claim.group] if isinstance(claim, Near) else claim.groups
+            assert {name for names in groups for name in ([names] if isinstance(names, str) else names)} <= labels
+            assert claim.row is None or claim.row in rows
+
+    def test_the_search_is_the_same_for_every_algorithm(self):
+        tried: dict[str, set[str]] = {}
+        for name in ("tuning_flat", "tuning_hierarchical"):
+            study = next(each for each in STUDIES if each.name == name)
+            for job in jobs_of(name):
+                tried.setdefault(job.overrides["algo"], set()).add(job.label(study.by))
+        assert sorted(tried) == ["dqn", "drqn", "hdqn", "v1", "v2"]
+        assert all(each == tried["v2"] for each in tried.values())
+        assert len(tried["v2"]) == 4
+
+    def test_what_runs_have_in_common(self):
+        settings = flat({"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None})
+        assert settings == {"seed": 0, "algo.gamma": 0.9, "algo.tau": 0.1}
+        job = Job({}, settings)
+        assert is_run_of(job, settings)
+        assert is_run_of(job, {"seed": 0, "algo.gamma": 0.9})  # it is older than tau
+        assert not is_run_of(job, settings | {"algo.gamma": 0.8})
+        assert not is_run_of(job, settings | {"algo.other": 1})
+
+
+def test_the_kept_runs_are_still_those_of_their_study():
+    """Settings that were renamed or left to the task since they were made must not make strangers of them."""
+    with ExitStack() as stack:
+        kept = report.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
+        found, missing = report.runs_of_jobs("gridworld", "small", kept)
+        of_authors, _ = report.runs_of_jobs("authors_choices", "small", kept)
+    assert (len(found), missing) == (18, 0)
+    assert len({run.entry.run.folder for _, run in found}) == 18
+    assert len(of_authors) > 0
+
+
+def test_a_bound_that_a_job_leaves_to_the_task_is_not_asked_for():
+    job = Job({}, {"algo.sub.max_target": None, "algo.gamma": 0.9})
+    assert is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.9})
+    assert not is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.99})
+    unbounded = Job({}, {"algo.sub.max_target": "unbounded"})
+    assert not is_run_of(unbounded, {"algo.sub.max_target": 1.0})
+    assert is_run_of(unbounded, {"algo.sub.max_target": None})  # what it was called before
+    assert not is_run_of(Job({}, {}), {"algo.sub.max_target": 1.0})

@@ -1,0 +1,51 @@
+import pytest
+import torch
+
+from hdrqn_torchrl.learning.finite import FiniteGuard, NonFiniteError
+
+NAN, INF = float("nan"), float("inf")
+
+
+def watch(guard, place="update 1", *, loss=1.0, first=(0.5, 2.0), second=(3.0,), norm=None):
+    gradients = {"first": torch.tensor(first), "second": torch.tensor(second)}
+    norm = torch.cat(list(gradients.values())).norm() if norm is None else torch.tensor(norm)
+    return guard.watch(torch.tensor(loss), gradients, norm, place)
+
+
+CASES = [
+    ({"loss": NAN}, "the loss became nan in update 1"),
+    ({"loss": -INF}, "the loss became -inf in update 1"),
+    ({"second": (NAN,)}, "the gradient of second became NaN or infinite in update 1"),
+    ({"first": (0.5, INF), "second": (NAN,)}, "the gradient of first became NaN or infinite in update 1"),
+    ({"first": (3e38, 3e38)}, "the gradient's norm became infinite in update 1"),
+]
+
+
+@pytest.mark.parametrize(("wrong", "message"), CASES)
+class TestWhatIsWrong:
+    def test_at_once(self, wrong, message):
+        with pytest.raises(NonFiniteError, match=f"^{message}$"):
+            watch(FiniteGuard(at_once=True), **wrong)
+
+    def test_later(self, wrong, message):
+        """Other updates before and after it change nothing."""
+        guard = FiniteGuard(at_once=False)
+        skips = [watch(guard, "update 0"), watch(guard, **wrong), watch(guard, "update 2"), watch(guard, loss=NAN)]
+        assert [skip.item() for skip in skips] == [0.0, 1.0, 1.0, 1.0]
+        for _ in range(2):
+            with pytest.raises(NonFiniteError, match=f"^{message}$"):
+                guard.check()
+
+
+def test_all_is_well():
+    guard = FiniteGuard(at_once=True)
+    assert watch(guard) is None
+    guard.check()
+    guard = FiniteGuard(at_once=False)
+    guard.check()
+    for place in range(5):
+        assert watch(guard, f"update {place}").item() == 0.0
+        guard.check()
+    watch(guard, "update 9", loss=NAN)
+    with pytest.raises(NonFiniteError, match="in update 9"):
+        guard.check()
