@@ -37,8 +37,8 @@ def run(tmp_path_factory):
 
 
 def call(script, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", [f"{script.__name__}.py", *arguments])
-    command_line(script.Settings, script.__doc__, script.main)
+    monkeypatch.setattr(sys, "argv", [f"program.py", *arguments])
+    command_line(script.Settings, script.__doc__, script.run)
 
 
 def test_both_levels_learn_and_evaluations_end(run):

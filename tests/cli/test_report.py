@@ -22,7 +22,7 @@ EXPERIMENTS = sorted(path.stem for path in (Path(CONF) / "experiment" / "paper")
 def make_run(folder, *overrides, score=1.0, finished=True):
     """A run folder as train.py writes it."""
     folder.mkdir(parents=True)
-    with initialize_config_dir(CONF, version_base="1.3"):
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=list(overrides), return_hydra_config=True)
     choices = {str(key): value for key, value in config.hydra.runtime.choices.items()}
     config = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
