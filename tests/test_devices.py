@@ -170,7 +170,12 @@ def test_what_waits_in_an_iteration_does_so_once_per_batch(name, as_on_gpu, tmp_
         found.append(sorted(wait for wait in waits.found if wait != DRAWN_BY_THE_HOST))
         trainer.collector.shutdown()
     assert found[0] == found[1]
-    expected = {"runs/trainer.py:check_finite", "runs/evaluation.py:finished", "data/replay.py:extend", "learning/finite.py:check"}
+    expected = {
+        "runs/trainer.py:check_finite",
+        "runs/evaluation.py:finished",
+        "data/replay.py:extend",
+        "learning/finite.py:check",
+    }
     expected |= {"data/continuity.py:check"}
     starts = {"data/samplers.py:_find_starts", "data/samplers.py:episode_starts"}
     expected |= starts if name == "v3" else {"data/samplers.py:sample"}

@@ -37,7 +37,7 @@ def run(tmp_path_factory):
 
 
 def call(script, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", [f"program.py", *arguments])
+    monkeypatch.setattr(sys, "argv", ["program.py", *arguments])
     command_line(script.Settings, script.__doc__, script.run)
 
 

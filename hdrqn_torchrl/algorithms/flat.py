@@ -48,7 +48,7 @@ def make_drqn(
         ['flat']
     """
     exploration = exploration or EpsilonGreedy()
-    has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", subgoals=False)
+    has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", levels=1)
     network = architecture.q_network(
         has.observation, num_actions=has.num_actions, recurrent=recurrent, prediction_steps=prediction_steps
     )

@@ -126,7 +126,7 @@ def make_hdrqn(
                 "the subgoal it pursued, not to the one that is learned about."
             )
     sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
-    has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", subgoals=True)
+    has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", levels=2)
     observation, num_actions, num_subgoals = has.observation, has.num_actions, has.num_subgoals
     masked = has.available_key is not None or (mask_reached and not repeatable_subgoals)
     mask_key = keys.SUBGOAL_MASK if masked else None

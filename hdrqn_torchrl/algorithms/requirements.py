@@ -10,7 +10,8 @@ from torchrl.envs import EnvBase, GymWrapper
 from torchrl.envs.transforms import TransformedEnv
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.envs import Task, task_of
+from hdrqn_torchrl.algorithms.levels import Level, make_levels
+from hdrqn_torchrl.envs import SubgoalSet, Task, task_of
 from hdrqn_torchrl.modules import Architecture
 from hdrqn_torchrl.transforms.entries import Entries, describe
 
@@ -31,18 +32,34 @@ class Requirements:
         num_envs: N.
         observation: spec of ``[N, ...]``.
         num_actions: how many there are.
-        num_subgoals: G; 0 for a flat agent.
-        hazard_key, available_key: entries that not every environment has, or ``None``.
+        subgoals: the sets of subgoals that the agent pursues, from near to far; none for a flat agent.
+        available_keys: for each of them, the entry that tells which are worth choosing, or ``None``.
+        hazard_key: an entry that not every environment has, or ``None``.
         task: what the environment states.
     """
 
     num_envs: int
     observation: TensorSpec
     num_actions: int
-    num_subgoals: int
+    subgoals: tuple[SubgoalSet, ...]
+    available_keys: tuple[NestedKey | None, ...]
     hazard_key: NestedKey | None
-    available_key: NestedKey | None
     task: Task
+
+    @property
+    def num_subgoals(self) -> int:
+        """G of the farthest set; 0 for a flat agent."""
+        return len(self.subgoals[-1]) if self.subgoals else 0
+
+    @property
+    def available_key(self) -> NestedKey | None:
+        """The farthest set's entry that tells which subgoals are worth choosing, if there is one."""
+        return self.available_keys[-1] if self.available_keys else None
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        """The agent's levels, from level 0 up."""
+        return make_levels(self.num_actions, self.subgoals)
 
     @property
     def hazard_keys(self) -> list[NestedKey]:
@@ -50,26 +67,28 @@ class Requirements:
         return [] if self.hazard_key is None else [self.hazard_key]
 
 
-def check_environment(env: EnvBase, architecture: Architecture, *, builder: str, subgoals: bool) -> Requirements:
+def check_environment(env: EnvBase, architecture: Architecture, *, builder: str, levels: int) -> Requirements:
     """Reads the specs of an environment.
 
     Args:
         env: bare environment.
         architecture: what reads the observation.
-        builder: in whose name is complained.
-        subgoals: whether there is more than one level.
+        builder: named in the error.
+        levels: of the agent; it pursues the last ``levels - 1`` sets of subgoals of the task.
 
     Raises:
-        ValueError: naming everything that is missing or wrong, and what the environment has.
+        ValueError: naming everything that is missing or wrong, and what the environment has; or if the task has fewer
+            sets of subgoals.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
         >>> from hdrqn_torchrl.modules import compact_network
-        >>> needs = check_environment(MultiGoalGridEnv(4), compact_network(), builder="make_v3", subgoals=True)
-        >>> needs.num_actions, needs.num_subgoals
-        (4, 2)
+        >>> needs = check_environment(MultiGoalGridEnv(4), compact_network(), builder="make_v3", levels=2)
+        >>> needs.num_actions, needs.num_subgoals, [level.name for level in needs.levels]
+        (4, 2, ['sub', 'meta'])
     """
-    entries = Entries.of(env)
+    entries, task = Entries.of(env), task_of(env)
+    _check_levels(levels, task)
     _check_batch(entries)
     _check_resets(env, entries)
     _check_observation(entries, architecture)
@@ -77,24 +96,50 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
     for key in (keys.DONE, keys.TERMINATED):
         entries.require_flags(key)
     entries.require_number(keys.REWARD)
-    if subgoals:
-        entries.require_flags(keys.ATTAINED, None)
+    if levels > 1:
         entries.require_number(keys.EXTRINSIC_REWARD)
-    num_subgoals = entries.specs[keys.ATTAINED].shape[-1] if subgoals and keys.ATTAINED in entries else 0
-    optional = {keys.HAZARD: 1, keys.AVAILABLE: num_subgoals} if subgoals else {}
-    present = {key: size for key, size in {**optional, keys.SUCCESS: 1}.items() if key in entries}
-    for key, size in present.items():
-        entries.require_flags(key, size)
+    subgoals = _subgoals(entries, task, levels - 1)
+    available = tuple(each.keys.available if each.keys.available in entries else None for each in subgoals)
+    for each, available_key in zip(subgoals, available, strict=True):
+        if available_key is not None:
+            entries.require_flags(available_key, len(each))
+    for key in (keys.HAZARD, keys.SUCCESS):
+        if key in entries and (levels > 1 or key == keys.SUCCESS):
+            entries.require_flags(key)
     entries.check(builder)
     return Requirements(
         num_envs=env.batch_size[0],
         observation=entries.specs[keys.OBSERVATION],
         num_actions=entries.specs[keys.ACTION].n,
-        num_subgoals=num_subgoals,
-        hazard_key=keys.HAZARD if keys.HAZARD in present else None,
-        available_key=keys.AVAILABLE if keys.AVAILABLE in present else None,
-        task=task_of(env),
+        subgoals=subgoals,
+        available_keys=available,
+        hazard_key=keys.HAZARD if levels > 1 and keys.HAZARD in entries else None,
+        task=task,
     )
+
+
+def _check_levels(levels: int, task: Task) -> None:
+    """Refuses an agent of more levels than the task has sets of subgoals for."""
+    most = max(1, len(task.subgoals)) + 1
+    if not 1 <= levels <= most:
+        raise ValueError(
+            f"levels must lie in [1, {most}], got {levels}: the task states {len(task.subgoals)} sets of subgoals, and "
+            "each level above the first chooses among one; state more of them (Task.subgoals)."
+        )
+
+
+def _subgoals(entries: Entries, task: Task, number: int) -> tuple[SubgoalSet, ...]:
+    """The farthest sets of subgoals, as many as ``number``; their ``attained`` is checked."""
+    if not number:
+        return ()
+    stated = task.subgoals[-number:]
+    for each in stated:
+        entries.require_flags(each.keys.attained, len(each))
+    if stated:
+        return stated
+    entries.require_flags(keys.ATTAINED, None)
+    size = entries.specs[keys.ATTAINED].shape[-1] if keys.ATTAINED in entries else 0
+    return (SubgoalSet(names=tuple(f"subgoal {index}" for index in range(size))),) if size else ()
 
 
 def _check_batch(entries: Entries) -> None:

@@ -128,7 +128,7 @@ def make_v3(
     if joint and meta_learning_rate is not None:
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
     meta_rate = learner.learning_rate if meta_learning_rate is None else meta_learning_rate
-    has = check_environment(env, architecture, builder="make_v3", subgoals=True)
+    has = check_environment(env, architecture, builder="make_v3", levels=2)
     learner = _with_sequences(learner, has.task)
     observation, num_actions, num_subgoals = has.observation, has.num_actions, has.num_subgoals
     for name, size, usual in (("memory_size", memory_size, 128), ("head_size", head_size, 128)):
