@@ -171,7 +171,7 @@ def test_what_waits_in_an_iteration_does_so_once_per_batch(name, as_on_gpu, tmp_
         trainer.collector.shutdown()
     assert found[0] == found[1]
     expected = {
-        "runs/trainer.py:check_finite",
+        "learning/finite.py:check_batch",
         "runs/evaluation.py:finished",
         "data/replay.py:extend",
         "learning/finite.py:check",

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
+
+from hdrqn_torchrl import keys
 
 
 class NonFiniteError(ArithmeticError):
@@ -95,3 +98,23 @@ class FiniteGuard:
 def _largest(gradients: Mapping[str, Tensor]) -> Sequence[Tensor]:
     """Largest absolute value of each; NaN where there is one."""
     return torch._foreach_norm(list(gradients.values()), torch.inf)
+
+
+def check_batch(batch: TensorDictBase, frames: int) -> None:
+    """Refuses a collected batch ``[N, T]`` with a NaN or an infinity in it.
+
+    Raises:
+        NonFiniteError: naming the place and the entry that came first; others follow from it.
+    """
+    floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
+    if torch.stack([torch.isfinite(value).all() for value in floats.values()]).all():
+        return
+    found = []
+    for key, value in floats.items():
+        if not torch.isfinite(value).all():
+            wrong = ~torch.isfinite(value).reshape(*batch.shape, -1).all(-1)
+            time, environment = wrong.t().nonzero()[0].tolist()
+            name = ".".join(key) if isinstance(key, tuple) else key
+            found.append((time, *(cause not in name for cause in (keys.OBSERVATION, keys.REWARD)), name, environment))
+    *_, name, environment = min(found)
+    raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")

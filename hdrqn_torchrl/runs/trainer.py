@@ -7,7 +7,6 @@ learners draws from its own.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,20 +14,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.collectors import BaseCollector
 
-from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.learning import Learner
-from hdrqn_torchrl.learning.finite import NonFiniteError
+from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch
 from hdrqn_torchrl.runs.checkpoint import MEMORY, Checkpoints, RandomState
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.state_checks import rules_of
+from hdrqn_torchrl.runs.window import Window, check_counters
 
 
 class Trainer:
@@ -73,10 +70,8 @@ class Trainer:
         self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
-        self._tracker, self._window = (
-            EpisodeTracker(algorithm.task, per_subgoal=algorithm.phases is not None),
-            _Window(),
-        )
+        self._tracker = EpisodeTracker(algorithm.task, per_subgoal=algorithm.phases is not None)
+        self._window = Window()
         self._stop = StopRequest()
         self._started = self._saved_at = time.monotonic()
         self._saved_position: tuple | None = None
@@ -128,7 +123,7 @@ class Trainer:
 
     def _receive(self, batch: TensorDictBase) -> None:
         """Counts and stores a collected batch ``[N, T]``."""
-        check_finite(batch, self.frames)
+        check_batch(batch, self.frames)
         self.frames += batch.numel()
         self.algorithm.observe(batch)
         finished = self._tracker.finished(batch)
@@ -189,7 +184,7 @@ class Trainer:
 
     def _begin_row(self) -> None:
         """Starts counting anew; only now that a row is on the disk: a stop before would lose what was counted."""
-        self._window = _Window(self.frames)
+        self._window = Window(self.frames)
         if self.algorithm.phases is not None:
             self.algorithm.phases.clear()
 
@@ -257,7 +252,7 @@ class Trainer:
         Raises:
             ValueError: if it can't be what a trainer returned.
         """
-        _check_counters(state)
+        check_counters(state)
         self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
         self._completed = state["completed"]
         self._started = time.monotonic() - state["wall_seconds"]
@@ -280,19 +275,6 @@ def _memory(learner: Learner) -> _Part:
     return _Part(learner.memory_state_dict, learner.load_memory_state_dict)
 
 
-def _check_counters(state: dict[str, Any]) -> None:
-    window, sums = state["window"], state["tracker"]["sums"]
-    counts = [state["frames"], state["episodes"], window["frames"], state["completed"] or 0, *window["counts"].values()]
-    times = [state["wall_seconds"], window["seconds"]]
-    fine = all(type(count) is int and 0 <= count < 2**53 for count in counts)
-    fine &= all(isinstance(each, (int, float)) and 0 <= each < 2**53 for each in times)
-    fine &= isinstance(state["best_return"], float) and state["best_return"] < math.inf
-    fine &= sums is None or (isinstance(sums, TensorDictBase) and sums.ndim == 1)
-    fine &= all(isinstance(each, TensorDictBase) and each.ndim == 1 for each in window["episodes"])
-    if not fine:
-        raise ValueError("the stored trainer's counts must be those of a training, got others; use another checkpoint.")
-
-
 def crossed(before: int, after: int, interval: int) -> bool:
     """Whether a multiple of ``interval`` lies in (before, after]."""
     return before // interval < after // interval
@@ -305,76 +287,3 @@ def _naming(learner: str) -> Iterator[None]:
         yield
     except NonFiniteError as error:
         raise NonFiniteError(f"{learner}: {error}") from error
-
-
-def check_finite(batch: TensorDictBase, frames: int) -> None:
-    """Refuses a collected batch ``[N, T]`` with a NaN or an infinity in it.
-
-    Raises:
-        NonFiniteError: naming the place and the entry that came first; others follow from it.
-    """
-    floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
-    if torch.stack([torch.isfinite(value).all() for value in floats.values()]).all():
-        return
-    found = []
-    for key, value in floats.items():
-        if not torch.isfinite(value).all():
-            wrong = ~torch.isfinite(value).reshape(*batch.shape, -1).all(-1)
-            time, environment = wrong.t().nonzero()[0].tolist()
-            name = ".".join(key) if isinstance(key, tuple) else key
-            found.append((time, *(cause not in name for cause in (keys.OBSERVATION, keys.REWARD)), name, environment))
-    *_, name, environment = min(found)
-    raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")
-
-
-class _Window:
-    """What happened since the last log point; tensors stay on their device until it is summed up."""
-
-    def __init__(self, frames: int = 0) -> None:
-        self._frames, self._since = frames, time.monotonic()
-        self._episodes: list[TensorDictBase] = []
-        self._sums: dict[str, dict[str, Tensor]] = {}
-        self._counts: dict[str, int] = {}
-
-    def add_episodes(self, episodes: TensorDictBase) -> None:
-        if len(episodes):
-            self._episodes.append(episodes)
-
-    def add_update(self, learner: str, metrics: dict[str, Tensor]) -> None:
-        sums = self._sums.get(learner)
-        self._sums[learner] = metrics if sums is None else {name: sums[name] + value for name, value in metrics.items()}
-        self._counts[learner] = self._counts.get(learner, 0) + 1
-
-    def summary(self, frames: int) -> Row:
-        seconds = max(time.monotonic() - self._since, 1e-9)
-        row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
-        if self._episodes:
-            episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
-            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items() if value.ndim == 1}
-            if "attained" in episodes:
-                row |= _visits(episodes["attained"])
-        for learner, sums in self._sums.items():
-            count = self._counts[learner]
-            row |= {f"{learner}/{name}": (total / count).item() for name, total in sums.items()}
-            row[f"{learner}/updates_per_second"] = round(count / seconds, 1)
-        return row
-
-    def state_dict(self) -> dict[str, Any]:
-        return {
-            "frames": self._frames,
-            "seconds": time.monotonic() - self._since,
-            "episodes": self._episodes,
-            "sums": self._sums,
-            "counts": self._counts,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._frames, self._since = state["frames"], time.monotonic() - state["seconds"]
-        self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]
-
-
-def _visits(attained: Tensor) -> Row:
-    """Share of episodes ``[M, G]`` that attained each subgoal, and how often they did."""
-    shares, visits = (attained > 0).float().mean(0).tolist(), attained.mean(0).tolist()
-    row: Row = {f"behaviour/attained_{index}": share for index, share in enumerate(shares)}
-    return row | {f"behaviour/visits_{index}": number for index, number in enumerate(visits)}

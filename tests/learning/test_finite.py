@@ -1,7 +1,8 @@
 import pytest
 import torch
+from tensordict import TensorDict
 
-from hdrqn_torchrl.learning.finite import FiniteGuard, NonFiniteError
+from hdrqn_torchrl.learning.finite import FiniteGuard, NonFiniteError, check_batch
 
 NAN, INF = float("nan"), float("inf")
 
@@ -49,3 +50,33 @@ def test_all_is_well():
     watch(guard, "update 9", loss=NAN)
     with pytest.raises(NonFiniteError, match="in update 9"):
         guard.check()
+
+
+def quiet_batch():
+    return TensorDict({"next": {"reward": torch.zeros(2, 5, 1)}}, [2, 5])
+
+
+class TestCheckBatch:
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+    @pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward"), ("sub_hidden")])
+    def test_it_names_the_entry_and_the_place(self, key, value):
+        batch = quiet_batch()
+        batch["observation"], batch["next", "observation"] = torch.zeros(2, 2, 5, 3)
+        batch["sub_hidden"] = torch.zeros(2, 5, 4)
+        check_batch(batch, 50)
+        entry = batch[key]
+        entry[1, 3, 0] = value
+        name = key if isinstance(key, str) else ".".join(key)
+        with pytest.raises(NonFiniteError, match=f"^{name} holds a NaN or an infinity, environment 1, after frame 50$"):
+            check_batch(batch, 50)
+
+    def test_the_observation_is_named_before_what_follows_from_it(self):
+        batch = quiet_batch()
+        batch["a"], batch["observation"] = torch.full((2, 2, 5), float("nan"))
+        with pytest.raises(NonFiniteError, match=r"^observation holds"):
+            check_batch(batch, 0)
+
+    def test_integers_and_flags_are_no_matter(self):
+        batch = quiet_batch()
+        batch["observation"] = torch.full((2, 5, 3), 255, dtype=torch.uint8)
+        check_batch(batch, 0)

@@ -7,11 +7,10 @@ from tensordict import TensorDict
 from torch import nn
 
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.learning.finite import NonFiniteError
 from hdrqn_torchrl.runs import trainer as trainer_module
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, load_policy
 from hdrqn_torchrl.runs.interruption import Interrupted
-from hdrqn_torchrl.runs.trainer import Trainer, check_finite, crossed
+from hdrqn_torchrl.runs.trainer import Trainer, crossed
 
 
 @pytest.mark.parametrize(
@@ -375,32 +374,6 @@ def test_its_clocks_stand_still_while_it_is_stopped(tmp_path, monkeypatch):
         (50, 5.0, 10.0),
         (100, 10.0, 10.0),
     ]
-
-
-class TestCheckFinite:
-    @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-    @pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward"), ("sub_hidden")])
-    def test_it_names_the_entry_and_the_place(self, key, value):
-        batch = quiet_batch()
-        batch["observation"], batch["next", "observation"] = torch.zeros(2, 2, 5, 3)
-        batch["sub_hidden"] = torch.zeros(2, 5, 4)
-        check_finite(batch, 50)
-        entry = batch[key]
-        entry[1, 3, 0] = value
-        name = key if isinstance(key, str) else ".".join(key)
-        with pytest.raises(NonFiniteError, match=f"^{name} holds a NaN or an infinity, environment 1, after frame 50$"):
-            check_finite(batch, 50)
-
-    def test_the_observation_is_named_before_what_follows_from_it(self):
-        batch = quiet_batch()
-        batch["a"], batch["observation"] = torch.full((2, 2, 5), float("nan"))
-        with pytest.raises(NonFiniteError, match=r"^observation holds"):
-            check_finite(batch, 0)
-
-    def test_integers_and_flags_are_no_matter(self):
-        batch = quiet_batch()
-        batch["observation"] = torch.full((2, 5, 3), 255, dtype=torch.uint8)
-        check_finite(batch, 0)
 
 
 def train_really(folder, name="v2", seed=0):

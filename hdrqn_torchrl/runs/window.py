@@ -1,0 +1,105 @@
+"""What is counted between two log points, and the check of a trainer's counters read back from a checkpoint."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hdrqn_torchrl.runs.logging import Row
+
+_MOST = 2**53  # the largest count that a number in a table shows exactly
+
+
+class Window:
+    """What happened since the last log point; tensors stay on their device until they are summed up.
+
+    Args:
+        frames: of the training at that log point.
+
+    Examples:
+        >>> window = Window(frames=1_000)
+        >>> window.add_update("sub", {"loss": torch.tensor(1.0)})
+        >>> window.add_update("sub", {"loss": torch.tensor(2.0)})
+        >>> window.summary(1_500)["sub/loss"]
+        1.5
+    """
+
+    def __init__(self, frames: int = 0) -> None:
+        self._frames, self._since = frames, time.monotonic()
+        self._episodes: list[TensorDictBase] = []
+        self._sums: dict[str, dict[str, Tensor]] = {}
+        self._counts: dict[str, int] = {}
+
+    def add_episodes(self, episodes: TensorDictBase) -> None:
+        """Takes the episodes ``[M]`` that ended (:meth:`~hdrqn_torchrl.runs.evaluation.EpisodeTracker.finished`)."""
+        if len(episodes):
+            self._episodes.append(episodes)
+
+    def add_update(self, learner: str, metrics: dict[str, Tensor]) -> None:
+        """Takes what one update of a learner returned."""
+        sums = self._sums.get(learner)
+        self._sums[learner] = metrics if sums is None else {name: sums[name] + value for name, value in metrics.items()}
+        self._counts[learner] = self._counts.get(learner, 0) + 1
+
+    def summary(self, frames: int) -> Row:
+        """The columns of the next log point, which is at ``frames``."""
+        seconds = max(time.monotonic() - self._since, 1e-9)
+        row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
+        if self._episodes:
+            episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
+            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items() if value.ndim == 1}
+            if "attained" in episodes:
+                row |= _visits(episodes["attained"])
+        for learner, sums in self._sums.items():
+            count = self._counts[learner]
+            row |= {f"{learner}/{name}": (total / count).item() for name, total in sums.items()}
+            row[f"{learner}/updates_per_second"] = round(count / seconds, 1)
+        return row
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was counted so far."""
+        return {
+            "frames": self._frames,
+            "seconds": time.monotonic() - self._since,
+            "episodes": self._episodes,
+            "sums": self._sums,
+            "counts": self._counts,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self._frames, self._since = state["frames"], time.monotonic() - state["seconds"]
+        self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]
+
+
+def _visits(attained: Tensor) -> Row:
+    """Share of episodes ``[M, G]`` that attained each subgoal, and how often they did."""
+    shares, visits = (attained > 0).float().mean(0).tolist(), attained.mean(0).tolist()
+    row: Row = {f"behaviour/attained_{index}": share for index, share in enumerate(shares)}
+    return row | {f"behaviour/visits_{index}": number for index, number in enumerate(visits)}
+
+
+def check_counters(state: dict[str, Any]) -> None:
+    """Refuses a trainer's counters that no training can have.
+
+    Args:
+        state: what :meth:`~hdrqn_torchrl.runs.trainer.Trainer.state_dict` returned, read from a file.
+
+    Raises:
+        ValueError: if a count or a time is no number of its kind, or a sum has another shape.
+    """
+    window, sums = state["window"], state["tracker"]["sums"]
+    counts = [state["frames"], state["episodes"], window["frames"], state["completed"] or 0, *window["counts"].values()]
+    times = [state["wall_seconds"], window["seconds"]]
+    possible = all(type(count) is int and 0 <= count < _MOST for count in counts)
+    possible &= all(isinstance(each, (int, float)) and 0 <= each < _MOST for each in times)
+    possible &= isinstance(state["best_return"], float) and state["best_return"] < math.inf
+    possible &= sums is None or (isinstance(sums, TensorDictBase) and sums.ndim == 1)
+    possible &= all(isinstance(each, TensorDictBase) and each.ndim == 1 for each in window["episodes"])
+    if not possible:
+        raise ValueError("the stored trainer's counts must be those of a training, got others; use another checkpoint.")
