@@ -1,6 +1,7 @@
 """Losses and the pure target functions beneath them."""
 
 from hdrqn_torchrl.objectives.all_subgoals import AllSubgoalsLoss
+from hdrqn_torchrl.objectives.base import SequenceLoss
 from hdrqn_torchrl.objectives.recurrent_dqn import RecurrentDQNLoss
 from hdrqn_torchrl.objectives.targets import (
     check_returns,
@@ -19,6 +20,7 @@ from hdrqn_torchrl.objectives.targets import (
 __all__ = [
     "AllSubgoalsLoss",
     "RecurrentDQNLoss",
+    "SequenceLoss",
     "check_returns",
     "double_q_value",
     "greedy_choice",

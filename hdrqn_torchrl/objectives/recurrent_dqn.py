@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
@@ -13,29 +11,24 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives import LossModule
-from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.modules import ObservationPredictor
-from hdrqn_torchrl.objectives.prediction import prediction_loss
+from hdrqn_torchrl.objectives.base import LossFunction, SequenceLoss, masked_mean
+from hdrqn_torchrl.objectives.sequences import Sequences, step_of, stored_once, stored_twice
 from hdrqn_torchrl.objectives.targets import (
     check_returns,
-    double_q_value,
     greedy_choice,
-    importance_weight,
     lambda_returns,
     n_step_returns,
     sequence_priority,
     smdp_target,
-    training_mask,
     watkins_trace,
 )
 
 
-class RecurrentDQNLoss(LossModule):
-    r"""Squared TD error of a recurrent Q-network on sequences ``[B, T]``, by Double Q-learning.
+class RecurrentDQNLoss(SequenceLoss):
+    r"""Squared TD error of a recurrent Q-network on sequences, by Double Q-learning.
 
     .. math:: y_t = r_t + \gamma^{k_t} Q'(x_{t+1}, \arg\max_a Q(x_{t+1}, a)), \qquad
               L = \text{mean}_t\,(y_t - Q(x_t, a_t))^2
@@ -45,12 +38,23 @@ class RecurrentDQNLoss(LossModule):
     times over T, starts its targets one step late and lets the state run across the slices of a flat batch, hence
     this loss.
 
-    - Steps that enter the loss: :func:`~hdrqn_torchrl.objectives.targets.training_mask`.
-    - Padding (``mask``) contributes nothing; even NaN in it reaches no gradient.
-    - Where a segment ends inside a sequence without being terminated (an option's time limit), the input that
-      follows belongs to the next segment; such a step is left out unless it is the last one of its sequence.
-    - Longer targets (``trace_decay``, ``n_step``) go on as long as the sequence and its segment do; behind that, the
-      value stands in. Steps that are left out of the loss lend nothing to others; those of the ``lookahead`` do.
+    Sequences come in two forms:
+
+    - with ``lookahead`` >= 1, each input is stored once: the last of the T + 1 steps only shows what the one before
+      led to. So does, for options, the row that ends a truncated episode
+      (:class:`~hdrqn_torchrl.data.OptionExtractor`);
+    - standard TorchRL sequences of T steps hold each input twice, at the root and under ``"next"``; of the latter the
+      last one is read.
+
+    Steps that enter the loss: :func:`~hdrqn_torchrl.objectives.training_mask`, and of these all whose target is in the
+    sequence. That of a terminated step always is. Otherwise it is not if the step is the last real one, if an episode
+    is truncated there, or if an option ends there without being terminated (its time limit; a subgoal that is gone):
+    the next step then pursues another subgoal, with a memory that starts anew, and says nothing about the value of
+    going on. In the second form the target of the last step is there in any case.
+
+    Padding (``mask``) contributes nothing; even NaN in it reaches no gradient. Longer targets (``trace_decay``,
+    ``n_step``) go on as long as the sequence and its segment do; behind that, the value stands in. Steps that are left
+    out of the loss lend nothing to others; those of the ``lookahead`` do.
 
     Args:
         value_network: in recurrent mode reads its ``in_keys`` ``[B, T + 1, ...]`` and writes ``action_value``
@@ -73,7 +77,8 @@ class RecurrentDQNLoss(LossModule):
         n_step: rewards before the value; 1 is the one-step target. Later actions are taken as they came, exploratory
             or not, as in Rainbow (Hessel et al., 2018) and R2D2: some bias for faster news.
         lookahead: steps at the end of each sequence that are there for the targets of those before and are not trained
-            themselves (:func:`~hdrqn_torchrl.objectives.target_lookahead`); ``burn_in`` is a share of the others.
+            themselves; ``burn_in`` is a share of the others. Inputs that are stored once need 1, longer targets
+            :func:`~hdrqn_torchrl.objectives.target_lookahead` more.
         state_keys: recurrent states that acting had, stored with the steps: sequences start from them, in both
             networks (Kapturowski et al., 2019), and from zero where ``init`` is set. None: all start from zero.
         delay_value: whether a target network is kept (update it with TorchRL's ``SoftUpdate`` or ``HardUpdate``).
@@ -134,7 +139,7 @@ class RecurrentDQNLoss(LossModule):
         burn_in: float = 0.5,
         train_exact_states: bool = True,
         double: bool = True,
-        loss_function: Literal["l2", "smooth_l1"] = "l2",
+        loss_function: LossFunction = "l2",
         max_target: float | None = None,
         predictor: ObservationPredictor | None = None,
         prediction_weight: float = 0.1,
@@ -146,40 +151,29 @@ class RecurrentDQNLoss(LossModule):
     ) -> None:
         if not 0.0 <= gamma <= 1.0:
             raise ValueError(f"gamma must lie in [0, 1], got {gamma}; the paper uses 0.99.")
-        if not 0.0 <= burn_in < 1.0:
-            raise ValueError(f"burn_in must lie in [0, 1), got {burn_in}; the paper's last-half rule is 0.5.")
-        if loss_function not in ("l2", "smooth_l1"):
-            raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the paper uses 'l2'.")
         check_returns(trace_decay, n_step)
-        if lookahead < 0:
-            raise ValueError(f"lookahead must be >= 0 steps, got {lookahead}; use target_lookahead().")
         if unknown := {unravel_key(key) for key in state_keys} - {unravel_key(key) for key in value_network.in_keys}:
             raise ValueError(
                 f"state_keys must be recurrent states that the network reads, got {sorted(map(str, unknown))}; a "
                 "feed-forward network has none."
             )
-        super().__init__()
-        self.convert_to_functional(value_network, "value_network", create_target_params=delay_value)
-        # Both networks as they are called, outside the module tree: their parameters are those registered above.
-        # Calling them directly saves two parameter swaps an update.
-        target = value_network
-        if delay_value:
-            target = deepcopy(value_network)
-            self._modules["target_value_network_params"].to_module(target, preserve_module_state=False)
-        self.__dict__["_networks"] = (value_network, target)
+        super().__init__(
+            value_network,
+            "value_network",
+            burn_in=burn_in,
+            train_exact_states=train_exact_states,
+            lookahead=lookahead,
+            double=double,
+            loss_function=loss_function,
+            predictor=predictor,
+            prediction_weight=prediction_weight,
+            delay_value=delay_value,
+        )
         self.register_buffer("gamma", torch.tensor(gamma))
-        self.burn_in, self.train_exact_states = burn_in if self._written_states else 0.0, train_exact_states
-        self.lookahead = lookahead
-        self.double, self.loss_function, self.max_target = double, loss_function, max_target
-        self.trace_decay, self.n_step = trace_decay, n_step
-        self.__dict__["_predictor"] = predictor  # its parameters are the network's
-        self.prediction_weight = prediction_weight
-        if predictor is not None:
-            self.out_keys = [*self.out_keys, "prediction_loss"]
+        if not self._written_states:
+            self.burn_in = 0.0
+        self.max_target, self.trace_decay, self.n_step = max_target, trace_decay, n_step
         self.state_keys = list(state_keys)
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """The keys are read at every call; nothing to pass on."""
 
     @property
     def _written_states(self) -> set[NestedKey]:
@@ -196,83 +190,60 @@ class RecurrentDQNLoss(LossModule):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        k = self.tensor_keys
-        nexts = [k.reward, k.done, k.terminated, *([] if k.steps is None else [k.steps]), *self._input_keys]
-        masks = [] if k.action_mask is None else [k.action_mask]
-        flags = [k.init] if k.eligible is None else [k.init, k.eligible]
-        now = [k.action, *flags, *self._input_keys, *self.state_keys, *masks]
-        return [*now, *(unravel_key(("next", key)) for key in nexts + masks)]
+        k, read = self.tensor_keys, self._read_keys
+        now = [k.action, k.init, *read, *self.state_keys, *([] if k.eligible is None else [k.eligible])]
+        nexts = [k.reward, k.done, k.terminated, *([] if k.steps is None else [k.steps])]
+        return [*now, *(unravel_key(("next", key)) for key in nexts + ([] if self.lookahead else read))]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        k, after = self.tensor_keys, tensordict["next"]
-        init = _steps_of(tensordict[k.init], tensordict)
-        mask = tensordict.get(k.mask, None)
-        valid = torch.ones_like(init) if mask is None else _steps_of(mask, tensordict)
-        init = init & valid
-        done, terminated = _steps_of(after[k.done], tensordict), _steps_of(after[k.terminated], tensordict)
-
-        inputs = self._inputs(tensordict, valid, init)
-        online, target, memory = self._action_values(inputs)
-        chosen = online[:, :-1].gather(-1, tensordict[k.action].unsqueeze(-1)).squeeze(-1)
+        k, parts = self.tensor_keys, self._take_apart(tensordict)
+        steps, after = parts.steps, parts.steps["next"]
+        online, target, memory = self._action_values(parts.inputs)
+        chosen = online[:, :-1].gather(-1, steps[k.action].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
-            allowed = None if k.action_mask is None else inputs.get(k.action_mask)
-            chooser = online.detach() if self.double else target
-            next_value = double_q_value(chooser[:, 1:], target[:, 1:], None if allowed is None else allowed[:, 1:])
-            steps = None if k.steps is None else _steps_of(after[k.steps], tensordict)
-            reward = _steps_of(after[k.reward], tensordict)
-            usable = valid & ~_ends_unseen(done & ~terminated, valid)
+            usable = parts.valid & (step_of(after[k.terminated], steps) | ~parts.cut)
             if k.eligible is not None:
-                usable = usable & _steps_of(tensordict[k.eligible], tensordict)
-            if self.n_step == 1 and not self.trace_decay:
-                wanted = smdp_target(reward, terminated, next_value, self.gamma, steps)
-            else:
-                # A terminated step has no future and a cut one no target, so only the next step need be looked at.
-                follows = (usable & ~init).roll(-1, 1)  # what the last step gets is not read
-                best = greedy_choice(online, allowed)[:, :-1]
-                wanted = self._longer_targets(
-                    reward.masked_fill(~valid, 0.0),
-                    terminated,
-                    next_value,
-                    self.gamma if steps is None else self.gamma**steps,
-                    follows=follows,
-                    greedy=best == tensordict[k.action],
-                )
-            if self.max_target is not None:
-                wanted = wanted.clamp(max=self.max_target)
-            trained = usable & training_mask(valid, init, self.burn_in, self.train_exact_states, self.lookahead)
-            count = trained.sum().clamp(min=1)
-            wanted = torch.where(trained, wanted, chosen)
-        distance = distance_loss(chosen, wanted, self.loss_function).masked_fill(~trained, 0.0)
-        if (weight := tensordict.get(k.priority_weight, None)) is not None:
-            distance = distance * importance_weight(weight).unsqueeze(-1)
-        loss = distance.sum() / count
+                usable = usable & step_of(steps[k.eligible], steps)
+            wanted = self._targets(online.detach(), target, parts, usable)
+            trained = usable & self._warm(parts.valid, parts.init, parts.lookahead)
+        loss = self._distance(chosen, wanted, trained, tensordict.get(k.priority_weight, None))
         with torch.no_grad():
             report = {
-                "td_error": (wanted - chosen).abs().masked_fill(~trained, 0.0).sum() / count,
-                "q_value": chosen.detach().masked_fill(~trained, 0.0).sum() / count,
-                "target": wanted.masked_fill(~trained, 0.0).sum() / count,
+                "td_error": masked_mean((wanted - chosen).abs(), trained),
+                "q_value": masked_mean(chosen, trained),
+                "target": masked_mean(wanted, trained),
                 "trained_steps": trained.sum(),
                 "priority": sequence_priority(wanted - chosen, trained),
             }
-        if self._predictor is not None and memory is not None:
-            prediction_error = self._prediction_loss(memory, inputs, tensordict, valid)
-            loss = loss + self.prediction_weight * prediction_error
-            report["prediction_loss"] = prediction_error.detach()
+        if self._predicts and memory is not None:
+            ends, seen = step_of(after[k.episode_done], steps), parts.seen
+            observation = parts.inputs[k.observation]
+            error = self._prediction_loss(memory, steps[k.action], observation, valid=seen, cut=ends)
+            loss = loss + self.prediction_weight * error
+            report["prediction_loss"] = error.detach()
         return TensorDict({"loss": loss, **report}, [])
 
-    def _prediction_loss(
-        self, memory: Tensor, inputs: TensorDictBase, tensordict: TensorDictBase, valid: Tensor
-    ) -> Tensor:
-        """Mean error of predictions within an episode; options may end on the way."""
-        k = self.tensor_keys
-        return prediction_loss(
-            self._predictor,
-            memory,
-            tensordict[k.action],
-            inputs[k.observation],
-            valid=torch.cat([valid[:, :1], valid], 1),
-            cut=_steps_of(tensordict["next", k.episode_done], tensordict),
-        )
+    def _targets(self, online: Tensor, target: Tensor, parts: Sequences, usable: Tensor) -> Tensor:
+        """Targets ``[B, T]`` by Q-values ``[B, T + 1, A]``; those of steps that are not ``usable`` mean nothing."""
+        k, after = self.tensor_keys, parts.steps["next"]
+        allowed = None if k.action_mask is None else parts.inputs.get(k.action_mask)
+        following = self._double_value(online[:, 1:], target[:, 1:], None if allowed is None else allowed[:, 1:])
+        reward, terminated = (step_of(after[key], parts.steps) for key in (k.reward, k.terminated))
+        lasted = None if k.steps is None else step_of(after[k.steps], parts.steps)
+        if self.n_step == 1 and not self.trace_decay:
+            wanted = smdp_target(reward, terminated, following, self.gamma, lasted)
+        else:
+            best = greedy_choice(online, allowed)[:, :-1]
+            wanted = self._longer_targets(
+                reward.masked_fill(~parts.valid, 0.0),
+                terminated,
+                following,
+                self.gamma if lasted is None else self.gamma**lasted,
+                # A terminated step has no future and a cut one no target, so only the next step need be looked at.
+                follows=(usable & ~parts.init).roll(-1, 1),  # what the last step gets is not read
+                greedy=best == parts.steps[k.action],
+            )
+        return wanted if self.max_target is None else wanted.clamp(max=self.max_target)
 
     def _longer_targets(
         self, reward: Tensor, ended: Tensor, next_value: Tensor, discount: Tensor, *, follows: Tensor, greedy: Tensor
@@ -283,28 +254,24 @@ class RecurrentDQNLoss(LossModule):
         trace = watkins_trace(greedy, self.trace_decay).masked_fill(~follows, 0.0)
         return lambda_returns(reward, ended, next_value, trace, discount)
 
-    def _inputs(self, tensordict: TensorDictBase, valid: Tensor, init: Tensor) -> TensorDictBase:
-        """The T + 1 inputs of each sequence: what was seen at each step, then what followed the last valid one."""
-        k = self.tensor_keys
-        mask_keys = [] if k.action_mask is None else [k.action_mask]
-        padded = k.mask in tensordict.keys(True) and not (on_host(valid) and bool(valid.all()))
-        nothing = torch.zeros_like(valid[:, :1])
-        own, reached = torch.cat([valid, nothing], 1), torch.cat([nothing, valid], 1)  # seen at, or after, a valid step
-        inputs = TensorDict({}, (tensordict.shape[0], tensordict.shape[1] + 1), device=tensordict.device)
-        for key in (*self._input_keys, *mask_keys):
-            now, following = tensordict[key], tensordict[unravel_key(("next", key))]
-            stream = torch.cat([now, following[:, -1:]], 1)
-            if padded:
-                stream = torch.where(_expand(own, stream), stream, torch.cat([now[:, :1], following], 1))
-                if stream.is_floating_point():
-                    stream = stream.masked_fill(~_expand(own | reached, stream), 0.0)
-            inputs.set(key, stream)
-        for key in self.state_keys:
-            state = tensordict[key]
-            state = state.masked_fill(_expand(init | ~valid, state), 0.0)
-            inputs.set(key, torch.cat([state, torch.zeros_like(state[:, :1])], 1))
-        restart = torch.cat([init, torch.zeros_like(init[:, :1])], 1)
-        return inputs.set(k.init, restart.unsqueeze(-1))
+    def _take_apart(self, tensordict: TensorDictBase) -> Sequences:
+        """Inputs and steps of sequences of either form."""
+        k, reads_next = self.tensor_keys, tensordict.get(("next", self._input_keys[0]), None) is not None
+        take_apart = stored_twice if reads_next or not self.lookahead else stored_once
+        return take_apart(
+            tensordict,
+            self._valid(tensordict),
+            read_keys=self._read_keys,
+            state_keys=self.state_keys,
+            init_key=k.init,
+            done_key=k.done,
+            lookahead=self.lookahead,
+        )
+
+    @property
+    def _read_keys(self) -> list[NestedKey]:
+        mask_key = self.tensor_keys.action_mask
+        return [*self._input_keys, *([] if mask_key is None else [mask_key])]
 
     def _action_values(self, inputs: TensorDictBase) -> tuple[Tensor, Tensor, Tensor | None]:
         """Q-values ``[B, T + 1, A]`` of main and target network; if it predicts, the main one's memory."""
@@ -315,18 +282,3 @@ class RecurrentDQNLoss(LossModule):
                 target = target_network(inputs.copy()).get(key)
             online = network(inputs.copy())
         return online.get(key), target, online.get(self.tensor_keys.memory, None)
-
-
-def _steps_of(value: Tensor, tensordict: TensorDictBase) -> Tensor:
-    """Drops the trailing dimension of a per-step scalar."""
-    return value if value.ndim == tensordict.ndim else value.squeeze(-1)
-
-
-def _expand(mask: Tensor, like: Tensor) -> Tensor:
-    return mask.view(mask.shape + (1,) * (like.ndim - mask.ndim))
-
-
-def _ends_unseen(cut: Tensor, valid: Tensor) -> Tensor:
-    """Steps that are cut off (``cut``) although another valid step follows: what they led to is not in the sequence."""
-    followed = torch.cat([valid[:, 1:], torch.zeros_like(valid[:, :1])], 1)
-    return cut & followed

@@ -688,7 +688,7 @@ class TestPrediction:
             torch.manual_seed(seed)
             result = loss(sample)
             with torch.no_grad():
-                inputs = loss._inputs(sample, valid, _init_of(loss, sample) & valid)
+                inputs = loss._take_apart(sample).inputs
                 memory = loss._action_values(inputs)[2]
                 errors = network.predictor(memory, sample["action"], inputs["observation"], steps=ahead)
             kept = [
