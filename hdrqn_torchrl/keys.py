@@ -30,7 +30,8 @@ SUBGOAL_VALUE = "subgoal_value"  # [G] float32: Q-values of the meta level where
 SUB_HIDDEN, SUB_CELL = "sub_hidden", "sub_cell"  # [H] float32: h^S
 MEMORY_HIDDEN, MEMORY_CELL = "memory_hidden", "memory_cell"  # [H] float32: v3's memory of the whole episode
 PREVIOUS_ACTION = "previous_action"  # [] int64: action of the step before; meaningless at the first step
-REPEATED_ACTION = "repeated_action"  # [2] int64: exploratory action in progress, and for how many more steps
+ACTION_EXPLORATION = "repeated_action"  # carried by the exploration of actions: [2] int64, a stretch in progress
+SUBGOAL_EXPLORATION = "subgoal_exploration"  # the same for subgoals, if theirs carries something
 META_HIDDEN, META_CELL = "meta_hidden", "meta_cell"  # [H] float32: h^M
 
 # Written by SubgoalTransform.
@@ -89,6 +90,10 @@ class OptionKeys:
     @property
     def subgoal_value(self) -> str:
         return self.of(SUBGOAL_VALUE)
+
+    @property
+    def subgoal_exploration(self) -> str:
+        return self.of(SUBGOAL_EXPLORATION)
 
     @property
     def option_init(self) -> str:

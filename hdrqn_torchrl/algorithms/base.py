@@ -91,7 +91,7 @@ def largest_target(setting: float | Literal["unbounded"] | None, stated: float) 
 
 
 def make_recurrent_loss(
-    network: Controller,
+    network: SubController | MetaController,
     settings: LearnerSettings,
     *,
     gamma: float = 0.99,
@@ -127,5 +127,5 @@ def make_recurrent_loss(
         predictor=network.network.predictor,
         prediction_weight=prediction_weight,
     )
-    loss.set_keys(**(loss_keys or {}))
+    loss.set_keys(action_value=network.action_value_key, **(loss_keys or {}))
     return loss

@@ -18,12 +18,11 @@ from torchrl.modules import recurrent_mode
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.modules.controllers import first_state
-from hdrqn_torchrl.modules.exploration import (
-    EpsilonGreedy,
-    RepeatingEpsilonGreedy,
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy, carried_by, choose
+from hdrqn_torchrl.modules.exploration_checks import (
     check_chooses_subgoals,
+    check_condition,
     check_two_schedules,
-    choose_action,
     exploration_or_greedy,
 )
 from hdrqn_torchrl.modules.features import Features
@@ -171,10 +170,10 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         observation_key, previous_action_key, init_key, option_init_key, active_subgoal_key, mask_key: read.
         action_key, subgoal_key, action_value_key, subgoal_value_key: written.
         hidden_key, cell_key: LSTM state ``[H]``.
-        repeated_action_key: random stretch in progress ``[2]``, for a :class:`RepeatingEpsilonGreedy`.
+        sub_exploration_key, meta_exploration_key: what the explorations carry, if anything.
 
     Raises:
-        ValueError: if an exploration is none, both are one, or ``meta_exploration`` repeats its choices.
+        ValueError: if an exploration is none, both are one, or ``meta_exploration`` can't choose subgoals.
 
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -206,24 +205,31 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         subgoal_value_key: NestedKey = keys.SUBGOAL_VALUE,
         hidden_key: NestedKey = keys.MEMORY_HIDDEN,
         cell_key: NestedKey = keys.MEMORY_CELL,
-        repeated_action_key: NestedKey = keys.REPEATED_ACTION,
+        sub_exploration_key: NestedKey = keys.ACTION_EXPLORATION,
+        meta_exploration_key: NestedKey = keys.SUBGOAL_EXPLORATION,
     ) -> None:
         super().__init__()
         self.network = network
         self.sub_exploration = exploration_or_greedy(sub_exploration, "sub_exploration")
         self.meta_exploration = exploration_or_greedy(meta_exploration, "meta_exploration")
         check_two_schedules(self.sub_exploration, self.meta_exploration)
+        check_condition(self.meta_exploration, "meta_exploration")
         check_chooses_subgoals(self.meta_exploration, "meta_exploration")
         self.sub_exploration.set_num_subgoals(network.num_subgoals)
         self.observation_key, self.previous_action_key, self.init_key = observation_key, previous_action_key, init_key
         self.option_init_key, self.active_subgoal_key, self.mask_key = option_init_key, active_subgoal_key, mask_key
         self.action_key, self.subgoal_key = action_key, subgoal_key
         self.action_value_key, self.subgoal_value_key = action_value_key, subgoal_value_key
-        self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
+        self.hidden_key, self.cell_key = hidden_key, cell_key
+        self.sub_exploration_key, self.meta_exploration_key = sub_exploration_key, meta_exploration_key
+        self.writes_values = False
+        """Whether acting, too, writes the Q-values that it chose by; for those who watch."""
         self.state_keys: list[NestedKey] = [hidden_key, cell_key]
-        carried = [*self.state_keys, previous_action_key]
-        if isinstance(self.sub_exploration, RepeatingEpsilonGreedy):
-            carried.append(repeated_action_key)
+        self._carried = {
+            **carried_by(self.sub_exploration, sub_exploration_key),
+            **carried_by(self.meta_exploration, meta_exploration_key),
+        }
+        carried = [*self.state_keys, previous_action_key, *self._carried]
         self.in_keys = [observation_key, init_key, option_init_key, active_subgoal_key, mask_key, *carried]
         self.out_keys = [subgoal_key, action_key, *(_next(key) for key in carried)]
 
@@ -232,9 +238,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         state = Unbounded(shape=(self.network.hidden_size,))
         carried = {self.hidden_key: state, self.cell_key: state.clone()}
         carried[self.previous_action_key] = Categorical(self.network.num_actions, shape=(), dtype=torch.int64)
-        if self.repeated_action_key in self.in_keys:
-            carried[self.repeated_action_key] = Unbounded(shape=(2,), dtype=torch.int64)
-        return TensorDictPrimer(carried, expand_specs=True)
+        return TensorDictPrimer({**carried, **self._carried}, expand_specs=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         read = (self.observation_key, self.previous_action_key, self.init_key, self.mask_key)
@@ -250,10 +254,14 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
         action_value, subgoal_value, (hidden, cell) = self.network.step(observation, previous_action, init, mask, state)
         starts = tensordict.get(self.option_init_key).squeeze(-1)
-        chosen = self.meta_exploration(subgoal_value, mask)
+        meta, key = self.meta_exploration, self.meta_exploration_key
+        chosen = choose(meta, subgoal_value, tensordict, key, mask=mask, due=starts)
         subgoal = torch.where(starts, chosen, tensordict.get(self.active_subgoal_key))
         wanted = values_of(action_value, subgoal)
-        action = choose_action(self.sub_exploration, wanted, tensordict, self.repeated_action_key, subgoal, starts)
+        sub, key = self.sub_exploration, self.sub_exploration_key
+        action = choose(sub, wanted, tensordict, key, condition=subgoal, starts=starts)
+        if self.writes_values:
+            tensordict.set(self.subgoal_value_key, subgoal_value).set(self.action_value_key, wanted)
         tensordict.set(self.subgoal_key, subgoal).set(self.action_key, action)
         for key, value in ((self.hidden_key, hidden), (self.cell_key, cell), (self.previous_action_key, action)):
             tensordict.set(_next(key), value)

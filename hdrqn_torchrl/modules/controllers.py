@@ -15,21 +15,19 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.data import Unbounded
+from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.modules.exploration import (
-    EpsilonGreedy,
-    RepeatingEpsilonGreedy,
+from hdrqn_torchrl.modules.exploration import EpsilonGreedy, carried_by, choose
+from hdrqn_torchrl.modules.exploration_checks import (
     check_chooses_subgoals,
+    check_condition,
     check_two_schedules,
-    choose_action,
     exploration_or_greedy,
 )
 from hdrqn_torchrl.modules.q_network import QNetwork, State
-from hdrqn_torchrl.modules.success import SuccessEpsilonGreedy
 
 
 class SubController(TensorDictModuleBase):
@@ -45,8 +43,7 @@ class SubController(TensorDictModuleBase):
         subgoal_key: the subgoal in force, or ``None`` for a flat agent.
         init_key: where the state restarts.
         hidden_key, cell_key: LSTM state ``[H]``.
-        repeated_action_key: random stretch in progress ``[2]``, for a
-            :class:`~hdrqn_torchrl.modules.RepeatingEpsilonGreedy`.
+        exploration_key: what the exploration carries, if anything.
 
     Raises:
         ValueError: if network or ``exploration`` do not fit a flat or hierarchical agent.
@@ -75,7 +72,7 @@ class SubController(TensorDictModuleBase):
         action_value_key: NestedKey = keys.ACTION_VALUE,
         hidden_key: NestedKey = keys.SUB_HIDDEN,
         cell_key: NestedKey = keys.SUB_CELL,
-        repeated_action_key: NestedKey = keys.REPEATED_ACTION,
+        exploration_key: NestedKey = keys.ACTION_EXPLORATION,
     ) -> None:
         super().__init__()
         if (subgoal_key is None) != (network.num_conditions == 0):
@@ -84,28 +81,24 @@ class SubController(TensorDictModuleBase):
                 f"and num_conditions={network.num_conditions}; set num_conditions to the number of subgoals."
             )
         self.network, self.exploration = network, exploration_or_greedy(exploration, "exploration")
-        if subgoal_key is not None:
+        if subgoal_key is None:
+            check_condition(self.exploration, "exploration")
+        else:
             self.exploration.set_num_subgoals(network.num_conditions)
-        elif isinstance(exploration, SuccessEpsilonGreedy):
-            raise ValueError(
-                "exploration must not be a SuccessEpsilonGreedy without subgoals, whose success it depends on; use "
-                "RepeatingEpsilonGreedy or EpsilonGreedy."
-            )
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
-        self.hidden_key, self.cell_key, self.repeated_action_key = hidden_key, cell_key, repeated_action_key
-        self.repeats = isinstance(self.exploration, RepeatingEpsilonGreedy)
+        self.hidden_key, self.cell_key, self.exploration_key = hidden_key, cell_key, exploration_key
+        self.writes_values = False
+        """Whether acting, too, writes its Q-values; for those who watch."""
         self.in_keys = [observation_key, *([] if subgoal_key is None else [subgoal_key]), init_key]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
-        carried = [*self.state_keys]
-        carried += [repeated_action_key] if self.repeats else []
+        carried = [*self.state_keys, *carried_by(self.exploration, exploration_key)]
         self.in_keys += carried
         self.out_keys = [action_key, *(_next(key) for key in carried)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
-        stretch = {self.repeated_action_key: Unbounded(shape=(2,), dtype=torch.int64)} if self.repeats else {}
-        return _primer(self.network, self.hidden_key, self.cell_key, stretch)
+        return _primer(self.network, self.hidden_key, self.cell_key, carried_by(self.exploration, self.exploration_key))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict.get(self.observation_key)
@@ -131,7 +124,9 @@ class SubController(TensorDictModuleBase):
     def _choose(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
         starts = tensordict.get(self.init_key).squeeze(-1)
-        return choose_action(self.exploration, value, tensordict, self.repeated_action_key, subgoal, starts)
+        if self.writes_values:
+            tensordict.set(self.action_value_key, value)
+        return choose(self.exploration, value, tensordict, self.exploration_key, condition=subgoal, starts=starts)
 
     def advance(self, tensordict: TensorDictBase, subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL) -> State:
         """LSTM state after one more observation, without a decision.
@@ -165,6 +160,7 @@ class MetaController(TensorDictModuleBase):
         active_subgoal_key: the subgoal to keep elsewhere.
         action_value_key: Q-values, written in learning.
         hidden_key, cell_key: LSTM state ``[H]``.
+        exploration_key: what the exploration carries from option to option, if anything.
 
     Raises:
         ValueError: if ``network`` has a condition, nothing is read, or ``exploration`` repeats its choices.
@@ -191,9 +187,10 @@ class MetaController(TensorDictModuleBase):
         subgoal_key: NestedKey = keys.SUBGOAL,
         gate_key: NestedKey = keys.OPTION_INIT,
         active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
-        action_value_key: NestedKey = keys.ACTION_VALUE,
+        action_value_key: NestedKey = keys.SUBGOAL_VALUE,
         hidden_key: NestedKey = keys.META_HIDDEN,
         cell_key: NestedKey = keys.META_CELL,
+        exploration_key: NestedKey = keys.SUBGOAL_EXPLORATION,
     ) -> None:
         super().__init__()
         if not input_keys or isinstance(input_keys, str):
@@ -206,19 +203,25 @@ class MetaController(TensorDictModuleBase):
                 "chooses the subgoal and is given none."
             )
         self.network, self.exploration = network, exploration_or_greedy(exploration, "exploration")
+        check_condition(self.exploration, "exploration")
         check_chooses_subgoals(self.exploration, "exploration")
         self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
         self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
         self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key
+        self.exploration_key = exploration_key
+        self.writes_values = False
+        """Whether acting, too, writes its Q-values; for those who watch."""
         self.acting_keys = [gate_key, active_subgoal_key]
         self.in_keys = [*self.input_keys, *([] if mask_key is None else [mask_key])]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
+        self._carried = carried_by(self.exploration, exploration_key)
+        self.acting_keys += self._carried
         self.in_keys += self.state_keys
-        self.out_keys = [subgoal_key, *(_next(key) for key in self.state_keys)]
+        self.out_keys = [subgoal_key, *(_next(key) for key in (*self.state_keys, *self._carried))]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
-        return _primer(self.network, self.hidden_key, self.cell_key)
+        return _primer(self.network, self.hidden_key, self.cell_key, self._carried)
 
     def _inputs(self, tensordict: TensorDictBase) -> Tensor:
         inputs = [tensordict.get(key) for key in self.input_keys]
@@ -238,8 +241,11 @@ class MetaController(TensorDictModuleBase):
         else:
             value = self.network.evaluate(inputs)
         mask = None if self.mask_key is None else tensordict.get(self.mask_key)
-        choice = torch.where(gate.squeeze(-1), self.exploration(value, mask), tensordict.get(self.active_subgoal_key))
-        return tensordict.set(self.subgoal_key, choice)
+        if self.writes_values:
+            tensordict.set(self.action_value_key, value)
+        due = gate.squeeze(-1)
+        chosen = choose(self.exploration, value, tensordict, self.exploration_key, mask=mask, due=due)
+        return tensordict.set(self.subgoal_key, torch.where(due, chosen, tensordict.get(self.active_subgoal_key)))
 
 
 class HierarchicalPolicy(TensorDictModuleBase):
@@ -307,7 +313,7 @@ def _next(key: NestedKey) -> tuple[str, ...]:
 
 
 def _primer(
-    network: QNetwork, hidden_key: NestedKey, cell_key: NestedKey, others: dict[NestedKey, Unbounded] | None = None
+    network: QNetwork, hidden_key: NestedKey, cell_key: NestedKey, carried: dict[NestedKey, TensorSpec]
 ) -> TensorDictPrimer:
     state = Unbounded(shape=(network.hidden_size,))
-    return TensorDictPrimer({hidden_key: state, cell_key: state.clone(), **(others or {})}, expand_specs=True)
+    return TensorDictPrimer({hidden_key: state, cell_key: state.clone(), **carried}, expand_specs=True)

@@ -1,13 +1,15 @@
-"""Epsilon-greedy choice with a schedule of its own (Algorithm 2)."""
+"""Exploration: one interface, and epsilon-greedy choice with a schedule of its own (Algorithm 2)."""
 
 from __future__ import annotations
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.utils import unravel_key
+from tensordict.utils import expand_as_right, unravel_key
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
+from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.modules.sizes import check_size
 
 
@@ -18,6 +20,10 @@ class EpsilonGreedy(nn.Module):
     worker processes and into checkpoints. Under ``ExplorationType.RANDOM`` (the collectors' default) it
     explores, under any other type it is greedy. TorchRL's ``EGreedyModule`` counts its schedule in a Python
     loop over frames and knows no gated choice, hence this module.
+
+    It is also the interface of every exploration: a subclass may change how random choices are drawn
+    (:meth:`random_choice`), how often (:meth:`scheduled`) or everything (:meth:`forward`), and may carry something
+    from step to step (:attr:`carried_spec`). Policies, builders and the trainer treat all alike.
 
     Args:
         start: epsilon at frame 0.
@@ -35,8 +41,26 @@ class EpsilonGreedy(nn.Module):
         >>> round(exploration.epsilon.item(), 3)
         0.55
         >>> exploration(torch.tensor([[0.0, 2.0, 1.0]]))
+        (tensor([1]), None)
+
+        An exploration of one's own: random choices prefer what is worth more.
+
+        >>> class SoftmaxEpsilonGreedy(EpsilonGreedy):
+        ...     def random_choice(self, values, mask):
+        ...         return torch.distributions.Categorical(logits=values).sample()
+        >>> from torchrl.envs import set_exploration_type
+        >>> with set_exploration_type(ExplorationType.RANDOM):
+        ...     choice, _ = SoftmaxEpsilonGreedy()(torch.tensor([[0.0, 100.0, 0.0]]))
+        >>> choice
         tensor([1])
     """
+
+    carried_spec: TensorSpec | None = None
+    """What is carried from step to step in each environment, from zeros at a reset; ``None``: nothing."""
+    for_actions_only: bool = False
+    """Whether it makes no sense where subgoals are chosen."""
+    needs_subgoals: bool = False
+    """Whether it depends on the subgoal that is pursued."""
 
     frames: Tensor
     epsilon: Tensor
@@ -69,43 +93,68 @@ class EpsilonGreedy(nn.Module):
         progress = (self.frames / self.anneal_frames).clamp(max=1.0)
         self.epsilon.copy_(self.start + (self.end - self.start) * progress)
 
-    def set_num_subgoals(self, num_subgoals: int) -> None:
-        """Tells how many subgoals the task has; here they make no difference."""
+    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys = OptionKeys()) -> None:  # noqa: B008 (frozen)
+        """Tells among how many subgoals the pursued one is; here they make no difference.
+
+        Args:
+            num_subgoals: G.
+            names: of the entries that tell what became of them.
+        """
 
     def observe(self, batch: TensorDictBase) -> None:
         """Takes note of a collected batch ``[N, T]``; here there is nothing to note."""
 
-    def forward(self, action_value: Tensor, mask: Tensor | None = None, subgoal: Tensor | None = None) -> Tensor:
-        """Chooses among ``action_value`` ``[*, A]`` where ``mask`` ``[*, A]`` allows (anywhere if it allows nothing).
+    def forward(
+        self,
+        values: Tensor,
+        *,
+        mask: Tensor | None = None,
+        condition: Tensor | None = None,
+        starts: Tensor | None = None,
+        carried: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Chooses among ``values`` where ``mask`` allows (anywhere if it allows nothing).
 
         Args:
-            action_value: Q-values.
-            mask: what may be chosen.
-            subgoal: the subgoal ``[*]`` that an action is chosen for.
+            values: Q-values ``[*, A]``.
+            mask: what may be chosen, ``[*, A]`` bool; ``None``: everything.
+            condition: the subgoal ``[*]`` that is pursued; ``None``: there is none.
+            starts: where that has just been chosen, ``[*]`` bool.
+            carried: what the last call returned, of :attr:`carried_spec`.
 
         Returns:
-            The choice ``[*]`` int64.
+            The choice ``[*]`` int64, and what to carry to the next step.
         """
         if mask is not None:
-            action_value = mask_values(action_value, mask)
-        greedy = action_value.argmax(-1)
+            values = mask_values(values, mask)
+        greedy = values.argmax(-1)
         if exploration_type() != ExplorationType.RANDOM:
-            return greedy
-        random = _random_choice(action_value, mask)
-        explores = torch.rand(greedy.shape, device=greedy.device) < self.epsilons(greedy, subgoal)
-        return torch.where(explores, random, greedy)
+            return greedy, None
+        random = self.random_choice(values, mask)
+        explores = torch.rand(greedy.shape, device=greedy.device) < self.epsilons(greedy, condition)
+        return torch.where(explores, random, greedy), None
 
-    def epsilons(self, like: Tensor, subgoal: Tensor | None = None) -> Tensor:
+    def random_choice(self, values: Tensor, mask: Tensor | None) -> Tensor:
+        """A uniformly random one of the choices that ``mask`` ``[*, A]`` allows, ``[*]``.
+
+        Args:
+            values: Q-values ``[*, A]``, minus infinity where ``mask`` forbids.
+            mask: as in :meth:`forward`.
+        """
+        lottery = torch.rand_like(values)
+        return (lottery if mask is None else mask_values(lottery, mask)).argmax(-1)
+
+    def epsilons(self, like: Tensor, condition: Tensor | None = None) -> Tensor:
         """Epsilon of each environment, to be broadcast against choices ``[N, *]``.
 
         Args:
             like: choices.
-            subgoal: the subgoal ``[N]`` that each environment pursues.
+            condition: the subgoal ``[N]`` that each environment pursues.
         """
-        return self._varied(like, subgoal) if self.fixed is None else torch.full_like(self.epsilon, self.fixed)
+        return self.scheduled(like, condition) if self.fixed is None else torch.full_like(self.epsilon, self.fixed)
 
-    def _varied(self, like: Tensor, subgoal: Tensor | None) -> Tensor:
-        """As the schedule says; here the same for all subgoals.
+    def scheduled(self, like: Tensor, condition: Tensor | None) -> Tensor:
+        """Epsilon of each environment as the schedule has it; here the same for all subgoals.
 
         With a ladder, environment i has :math:`\\epsilon^{1 + \\alpha i / (N - 1)}` (Ape-X, Horgan et al., 2018).
         """
@@ -115,150 +164,47 @@ class EpsilonGreedy(nn.Module):
         return self.epsilon ** (1.0 + self.ladder * rung)
 
 
-class RepeatingEpsilonGreedy(EpsilonGreedy):
-    r"""Temporally extended epsilon-greedy (Dabney et al., 2021): a random action is kept for some steps.
-
-    Their number n has the probability :math:`P(n) \propto n^{-\mu}`, up to ``max_repeats`` (a zeta distribution, cut).
-    A walk of single random steps rarely leaves its corner; this one does. The policy carries what is in progress. A
-    stretch ends with its option: the next one may be for a subgoal that needs no exploring any more.
-
-    Args:
-        start, end, anneal_frames, ladder: as in :class:`EpsilonGreedy`; epsilon is the share of random steps, not of
-            steps at which a random stretch starts (a little more than that, where options cut stretches short).
-        exponent: :math:`\mu`.
-        max_repeats: longest stretch.
-
-    Raises:
-        ValueError: if an argument breaks its rule.
-
-    Examples:
-        >>> exploration = RepeatingEpsilonGreedy(1.0, 1.0, max_repeats=1)
-        >>> choice, carried = exploration.extend(torch.zeros(3, 4), torch.zeros(3, 2, dtype=torch.int64))
-        >>> carried[:, 1].tolist()
-        [0, 0, 0]
-    """
-
-    _durations: Tensor
-
-    def __init__(
-        self,
-        start: float = 1.0,
-        end: float = 0.1,
-        *,
-        anneal_frames: int = 100_000,
-        ladder: float = 0.0,
-        exponent: float = 2.0,
-        max_repeats: int = 15,
-    ) -> None:
-        super().__init__(start, end, anneal_frames=anneal_frames, ladder=ladder)
-        if not 0.0 < exponent < float("inf"):
-            raise ValueError(f"exponent must be > 0 and finite, got {exponent}; Dabney et al. use 2.")
-        check_size("max_repeats", max_repeats, 15)
-        durations = torch.arange(1, max_repeats + 1, dtype=torch.float32) ** -exponent
-        self.register_buffer("_durations", durations / durations.sum(), persistent=False)
-        self._mean_duration = (torch.arange(1, max_repeats + 1) * self._durations).sum().item()
-
-    def extend(
-        self, action_value: Tensor, carried: Tensor, subgoal: Tensor | None = None, starts: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Chooses, given the stretch in progress.
-
-        Args:
-            action_value: Q-values ``[*, A]``.
-            carried: random action in progress and the steps that it still lasts, ``[*, 2]`` int64.
-            subgoal: the subgoal ``[*]`` that an action is chosen for.
-            starts: where an option starts, ``[*]`` bool: a stretch in progress is over.
-
-        Returns:
-            The choice ``[*]`` int64, and what to carry to the next step.
-        """
-        greedy = action_value.argmax(-1)
-        if exploration_type() != ExplorationType.RANDOM:
-            return greedy, torch.zeros_like(carried)
-        if starts is not None:
-            carried = carried.masked_fill(starts.unsqueeze(-1), 0)
-        action, left = carried.unbind(-1)
-        share = self.epsilons(greedy, subgoal)
-        begins = share / (share + (1.0 - share) * self._mean_duration)  # so that `share` of all steps are random
-        begins = (left == 0) & (torch.rand(greedy.shape, device=greedy.device) < begins)
-        durations = torch.multinomial(self._durations, greedy.numel(), replacement=True).view_as(greedy) + 1
-        action = torch.where(begins, _random_choice(action_value, None), action)
-        left = torch.where(begins, durations, left)
-        choice = torch.where(left > 0, action, greedy)
-        return choice, torch.stack([action, (left - 1).clamp(min=0)], -1)
-
-
-def choose_action(
+def choose(
     exploration: EpsilonGreedy,
-    action_value: Tensor,
+    values: Tensor,
     tensordict: TensorDictBase,
-    repeated_action_key: NestedKey,
-    subgoal: Tensor | None = None,
+    carried_key: NestedKey,
+    *,
+    mask: Tensor | None = None,
+    condition: Tensor | None = None,
     starts: Tensor | None = None,
+    due: Tensor | None = None,
 ) -> Tensor:
-    """The choice of a policy in ``tensordict``, which carries the random stretch in progress, if there can be one.
+    """One level's choice in a policy, whatever its exploration carries.
 
     Args:
         exploration: how to choose.
-        action_value: Q-values ``[*, A]``.
-        tensordict: a :class:`RepeatingEpsilonGreedy` reads ``repeated_action_key`` and writes it under ``"next"``.
-        repeated_action_key: ``[*, 2]`` int64.
-        subgoal: the subgoal ``[*]`` that the action is chosen for.
-        starts: where an option starts, ``[*]`` bool.
+        values: Q-values ``[*, A]``.
+        tensordict: what the exploration carries is read from it, and written below ``"next"``.
+        carried_key: under this name; neither read nor written if the exploration carries nothing.
+        mask, condition, starts: as in :class:`EpsilonGreedy`.
+        due: where a choice is due, ``[*]`` bool; elsewhere what is carried stays. ``None``: everywhere.
 
     Returns:
         ``[*]`` int64.
     """
-    if not isinstance(exploration, RepeatingEpsilonGreedy):
-        return exploration(action_value, subgoal=subgoal)
-    action, carried = exploration.extend(action_value, tensordict.get(repeated_action_key), subgoal, starts)
-    tensordict.set(unravel_key(("next", repeated_action_key)), carried)
-    return action
+    carried = None if exploration.carried_spec is None else tensordict.get(carried_key)
+    choice, following = exploration(values, mask=mask, condition=condition, starts=starts, carried=carried)
+    if carried is not None:
+        if due is not None:
+            following = torch.where(expand_as_right(due, carried), following, carried)
+        tensordict.set(unravel_key(("next", carried_key)), following)
+    return choice
 
 
-def exploration_or_greedy(exploration: EpsilonGreedy | None, name: str) -> EpsilonGreedy:
-    """What an argument called ``name`` means: ``None`` is always greedy.
+def carried_by(exploration: EpsilonGreedy, key: NestedKey) -> dict[NestedKey, TensorSpec]:
+    """The entry that ``exploration`` carries under ``key``, for a primer; empty if it carries nothing.
 
-    Raises:
-        ValueError: if it is something else.
+    Examples:
+        >>> carried_by(EpsilonGreedy(), "carried")
+        {}
     """
-    if exploration is None:
-        return EpsilonGreedy(0.0, 0.0)
-    if not isinstance(exploration, EpsilonGreedy):
-        raise ValueError(f"{name} must be an EpsilonGreedy or None, got {exploration!r}; None is always greedy.")
-    return exploration
-
-
-def check_two_schedules(sub: EpsilonGreedy, meta: EpsilonGreedy) -> None:
-    """Refuses one exploration for two levels.
-
-    Raises:
-        ValueError: if they are the same.
-    """
-    if sub is meta:
-        raise ValueError(
-            f"meta_exploration must not be the sub level's, got one {type(meta).__name__} for both: its schedule would "
-            "run twice as fast; give each level its own."
-        )
-
-
-def check_chooses_subgoals(exploration: EpsilonGreedy, name: str) -> None:
-    """Refuses what is made for actions where subgoals are chosen.
-
-    Raises:
-        ValueError: if ``exploration``, the argument ``name``, repeats its choices.
-    """
-    if isinstance(exploration, RepeatingEpsilonGreedy):
-        raise ValueError(
-            f"{name} must be an EpsilonGreedy where subgoals are chosen, got {type(exploration).__name__}: a choice "
-            "lasts for an option there, and is not made on the way to another subgoal; use EpsilonGreedy."
-        )
-
-
-def _random_choice(action_value: Tensor, mask: Tensor | None) -> Tensor:
-    """A uniformly random one of the allowed actions, ``[*]``."""
-    lottery = torch.rand_like(action_value)
-    return (lottery if mask is None else mask_values(lottery, mask)).argmax(-1)
+    return {} if exploration.carried_spec is None else {key: exploration.carried_spec.clone()}
 
 
 def mask_values(values: Tensor, mask: Tensor) -> Tensor:

@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.modules.exploration import RepeatingEpsilonGreedy
+from hdrqn_torchrl.keys import OptionKeys
+from hdrqn_torchrl.modules.repeating import RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.sizes import check_size
 
 
@@ -93,6 +94,7 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
     """
 
     success: SubgoalSuccess
+    needs_subgoals = True
 
     def __init__(
         self,
@@ -111,16 +113,22 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
         check_size("window", window, 100)
         self.window = window
 
-    def set_num_subgoals(self, num_subgoals: int) -> None:
+    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys = OptionKeys()) -> None:  # noqa: B008 (frozen)
         """Must be called before it chooses; the policies that explore with it do."""
-        self.success = SubgoalSuccess(num_subgoals, window=self.window)
+        self.success = SubgoalSuccess(
+            num_subgoals,
+            window=self.window,
+            active_subgoal_key=names.active_subgoal,
+            option_done_key=names.option_done,
+            reached_key=names.subgoal_reached,
+        )
 
     def observe(self, batch: TensorDictBase) -> None:
         """Learns from a collected batch how often subgoals were reached."""
         self.success.observe(batch)
 
-    def _varied(self, like: Tensor, subgoal: Tensor | None) -> Tensor:
-        scheduled = super()._varied(like, subgoal)
-        if subgoal is None:
-            return scheduled
-        return (scheduled * (1.0 - self.success.rates[subgoal])).clamp(min=self.end)
+    def scheduled(self, like: Tensor, condition: Tensor | None) -> Tensor:
+        epsilon = super().scheduled(like, condition)
+        if condition is None:
+            return epsilon
+        return (epsilon * (1.0 - self.success.rates[condition])).clamp(min=self.end)

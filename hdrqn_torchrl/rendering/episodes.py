@@ -238,7 +238,7 @@ def _listening(explorations: dict[str, EpsilonGreedy]) -> Iterator[dict[str, Dec
     heard: dict[str, Decision] = {}
     with ExitStack() as stack:
         for level, exploration in explorations.items():
-            for method in ("forward", "extend"):
+            for method in ("forward",):
                 if hasattr(exploration, method):
                     setattr(exploration, method, _overheard(getattr(exploration, method), heard, level))
                     stack.callback(delattr, exploration, method)
@@ -252,7 +252,7 @@ def _overheard(choose: Callable, heard: dict[str, Decision], level: str) -> Call
     def choose_and_note(*args, **kwargs) -> Any:
         result = choose(*args, **kwargs)
         given = signature.bind(*args, **kwargs).arguments
-        values, mask = given["action_value"][0], given.get("mask")
+        values, mask = given["values"][0], given.get("mask")
         allowed = torch.ones_like(values, dtype=torch.bool) if mask is None else mask[0]
         choice = result[0] if isinstance(result, tuple) else result
         heard[level] = Decision(tuple(values.tolist()), tuple(allowed.tolist()), int(choice[0]))

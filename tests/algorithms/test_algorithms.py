@@ -778,15 +778,8 @@ class TestRepeatedActions:
         exploration = SuccessEpsilonGreedy(1.0, 0.0, max_repeats=15, exponent=0.01)
         algorithm = build(name, env, sub_exploration=exploration, max_option_steps=3)
         exploration.success.rates.copy_(torch.tensor([0.0, 1.0]))  # the second subgoal needs no exploring
-        actions, greedy = [], []
-        choose = exploration.extend
-
-        def listen(values, *others):
-            greedy.append(values.argmax(-1))
-            actions.append(choose(values, *others))
-            return actions[-1]
-
-        exploration.extend = listen
+        greedy = []
+        exploration.register_forward_pre_hook(lambda _, inputs: greedy.append(inputs[0].argmax(-1)))
         with set_exploration_type(ExplorationType.RANDOM):
             steps = algorithm.transform(env).rollout(40, algorithm.policy, break_when_any_done=False)
         mastered = steps["subgoal"] == 1
@@ -796,16 +789,16 @@ class TestRepeatedActions:
         starts = steps["option_init"].squeeze(-1)
         assert (steps["repeated_action"][..., 1] > 0)[starts & mastered].any()  # there was something to drop
 
-    @pytest.mark.parametrize("kind", [RepeatingEpsilonGreedy, SuccessEpsilonGreedy])
     @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
-    def test_subgoals_are_not_repeated(self, name, kind):
-        with pytest.raises(ValueError, match=f"exploration must be an EpsilonGreedy .* got {kind.__name__}: .*; use"):
-            build(name, small_env(), meta_exploration=kind())
+    def test_subgoals_are_not_repeated(self, name):
+        with pytest.raises(ValueError, match="where subgoals are chosen, got RepeatingEpsilonGreedy: "):
+            build(name, small_env(), meta_exploration=RepeatingEpsilonGreedy())
 
-    @pytest.mark.parametrize("name", ["dqn", "drqn"])
-    def test_flat_agents_have_no_success_of_subgoals_to_go_by(self, name):
-        with pytest.raises(ValueError, match="exploration must not be a SuccessEpsilonGreedy without subgoals"):
-            build(name, small_env(), exploration=SuccessEpsilonGreedy())
+    @pytest.mark.parametrize("name", ["dqn", "drqn", "v1", "v2", "hdqn", "v3"])
+    def test_the_farthest_level_pursues_no_subgoal_whose_success_could_count(self, name):
+        place = "exploration" if name in ("drqn", "dqn") else "meta_exploration"
+        with pytest.raises(ValueError, match="not be a SuccessEpsilonGreedy where no subgoal is pursued"):
+            build(name, small_env(), **{place: SuccessEpsilonGreedy()})
 
     def test_a_greedy_policy_does_not_repeat(self):
         env = small_env(4)

@@ -226,7 +226,7 @@ class TestPolicy:
         plain = AllSubgoalsPolicy(make_network(), RepeatingEpsilonGreedy())
         read = {name: ("agent", name.removesuffix("_key")) for name in vars(plain) if name.endswith("_key")}
         names = {getattr(plain, name): key[1] for name, key in read.items()}
-        assert len(names) == 13
+        assert len(names) == 14
         moved = AllSubgoalsPolicy(plain.network, plain.sub_exploration, **read)
         td = root(option_init=torch.tensor([[False], [True], [False]]))
         agent = TensorDict({names[key]: value for key, value in td.items()}, batch_size=3)

@@ -204,7 +204,7 @@ class TestActingAndLearningAgree:
 
     def learned_values(self, controller, sequences):
         with set_recurrent_mode(True), torch.no_grad():
-            return controller(sequences.clone())["action_value"]
+            return controller(sequences.clone())[controller.action_value_key]
 
     @pytest.mark.parametrize("network", NETWORKS)
     def test_flat(self, network):

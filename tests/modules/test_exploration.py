@@ -1,9 +1,13 @@
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Unbounded
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy
-from hdrqn_torchrl.modules.exploration import mask_values
+from hdrqn_torchrl import algorithms
+from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
+from hdrqn_torchrl.modules.exploration import choose, mask_values
 
 VALUES = torch.tensor([3.0, 9.0, 1.0, 5.0])
 
@@ -28,7 +32,7 @@ def test_the_share_of_random_choices_is_epsilon():
     torch.manual_seed(0)
     exploration = EpsilonGreedy(0.4, 0.4)
     with set_exploration_type(ExplorationType.RANDOM):
-        choices = exploration(VALUES.expand(40_000, 4))
+        choices, _ = exploration(VALUES.expand(40_000, 4))
     shares = choices.bincount(minlength=4) / len(choices)
     assert shares.tolist() == pytest.approx([0.1, 0.7, 0.1, 0.1], abs=0.01)
 
@@ -36,7 +40,7 @@ def test_the_share_of_random_choices_is_epsilon():
 def test_every_row_draws_for_itself():
     torch.manual_seed(0)
     with set_exploration_type(ExplorationType.RANDOM):
-        choices = EpsilonGreedy(1.0, 1.0)(VALUES.expand(5, 200, 4))
+        choices, _ = EpsilonGreedy(1.0, 1.0)(VALUES.expand(5, 200, 4))
     assert choices.shape == (5, 200)
     assert all(row.unique().tolist() == [0, 1, 2, 3] for row in choices)
 
@@ -44,7 +48,7 @@ def test_every_row_draws_for_itself():
 @pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
 def test_any_other_exploration_type_is_greedy(kind):
     with set_exploration_type(kind):
-        assert (EpsilonGreedy(1.0, 1.0)(VALUES.expand(500, 4)) == 1).all()
+        assert (EpsilonGreedy(1.0, 1.0)(VALUES.expand(500, 4))[0] == 1).all()
 
 
 class TestMask:
@@ -52,12 +56,12 @@ class TestMask:
 
     def test_greedy_takes_the_best_that_is_allowed(self):
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            assert EpsilonGreedy()(VALUES, self.MASK).item() == 0
+            assert EpsilonGreedy()(VALUES, mask=self.MASK)[0].item() == 0
 
     def test_exploring_takes_all_that_are_allowed_and_only_those(self):
         torch.manual_seed(0)
         with set_exploration_type(ExplorationType.RANDOM):
-            choices = EpsilonGreedy(1.0, 1.0)(VALUES.expand(2_000, 4), self.MASK.expand(2_000, 4))
+            choices, _ = EpsilonGreedy(1.0, 1.0)(VALUES.expand(2_000, 4), mask=self.MASK.expand(2_000, 4))
         shares = choices.bincount(minlength=4) / len(choices)
         assert shares.tolist() == pytest.approx([0.5, 0.0, 0.5, 0.0], abs=0.05)
 
@@ -66,7 +70,7 @@ class TestMask:
         torch.manual_seed(0)
         mask = torch.tensor([[False] * 4, [False, False, True, False]]).repeat(500, 1)
         with set_exploration_type(kind):
-            choices = EpsilonGreedy(1.0, 1.0)(VALUES.expand(1_000, 4), mask)
+            choices, _ = EpsilonGreedy(1.0, 1.0)(VALUES.expand(1_000, 4), mask=mask)
         assert choices[::2].unique().tolist() == ([0, 1, 2, 3] if kind == ExplorationType.RANDOM else [1])
         assert (choices[1::2] == 2).all()
 
@@ -119,7 +123,7 @@ class TestLadder:
     def test_the_share_of_random_choices_of_each_environment(self):
         values = torch.cat([torch.ones(1), torch.zeros(99)])
         with set_exploration_type(ExplorationType.RANDOM):
-            choices = EpsilonGreedy(0.5, 0.5, ladder=1.0)(values.expand(2, 20_000, 100))
+            choices, _ = EpsilonGreedy(0.5, 0.5, ladder=1.0)(values.expand(2, 20_000, 100))
         assert (choices != 0).float().mean(1).tolist() == pytest.approx([0.495, 0.2475], abs=0.02)
 
     def test_a_negative_one(self):
@@ -127,102 +131,45 @@ class TestLadder:
             EpsilonGreedy(ladder=-1.0)
 
 
-class TestRepeatingEpsilonGreedy:
-    ACTIONS = 64  # so many that a random one is hardly ever the greedy one, action 0
+class Alternating(EpsilonGreedy):
+    """Takes every choice in turn, whatever it is worth: an exploration of a user's own, which carries a count."""
 
-    def play(self, exploration, num_envs=1_000, steps=200):
-        """Choices and what was carried before each, ``[T, N]`` and ``[T + 1, N, 2]``."""
-        values = torch.zeros(num_envs, self.ACTIONS)
-        values[:, 0] = 1.0
-        choices, carried = [], [torch.zeros(num_envs, 2, dtype=torch.int64)]
-        with set_exploration_type(ExplorationType.RANDOM):
-            for _ in range(steps):
-                choice, following = exploration.extend(values, carried[-1])
-                choices.append(choice)
-                carried.append(following)
-        return torch.stack(choices), torch.stack(carried)
+    carried_spec = Unbounded(shape=(1,), dtype=torch.int64)
 
-    @pytest.mark.parametrize(
-        ("epsilon", "settings"),
-        [
-            (0.0, {}),
-            (0.1, {}),
-            (0.5, {}),
-            (1.0, {}),
-            (0.5, {"max_repeats": 1}),
-            (0.5, {"exponent": 0.5, "max_repeats": 8}),
-        ],
+    def forward(self, values, *, mask=None, condition=None, starts=None, carried=None):
+        return carried.squeeze(-1) % values.shape[-1], carried + 1
+
+
+class TestChoose:
+    def test_what_an_exploration_carries_is_read_and_written_under_the_key_given(self):
+        root = TensorDict({("a", "count"): torch.tensor([[2], [5], [7]])}, [3])
+        assert choose(Alternating(), VALUES.expand(3, 4), root, ("a", "count")).tolist() == [2, 1, 3]
+        assert root["next", "a", "count"].tolist() == [[3], [6], [8]]
+
+    def test_where_no_choice_is_due_it_stays(self):
+        root = TensorDict({"count": torch.tensor([[2], [5], [7]])}, [3])
+        choose(Alternating(), VALUES.expand(3, 4), root, "count", due=torch.tensor([True, False, True]))
+        assert root["next", "count"].tolist() == [[3], [5], [8]]
+
+    def test_an_exploration_that_carries_nothing_reads_and_writes_nothing(self):
+        root = TensorDict({}, [3])
+        assert choose(EpsilonGreedy(0.0, 0.0), VALUES.expand(3, 4), root, "count").tolist() == [1, 1, 1]
+        assert root.is_empty()
+
+
+@pytest.mark.parametrize("level", ["sub", "meta"])
+@pytest.mark.parametrize("builder", ["make_hdrqn", "make_v3"])
+def test_an_exploration_of_ones_own_works_at_every_level(builder, level):
+    env = MultiGoalGridEnv(num_envs=4, seed=0, max_steps=40)
+    agent = getattr(algorithms, builder)(
+        env, compact_network(), max_option_steps=7, **{f"{level}_exploration": Alternating()}
     )
-    def test_epsilon_is_the_share_of_random_steps(self, epsilon, settings):
-        choices, _ = self.play(RepeatingEpsilonGreedy(epsilon, epsilon, **settings))
-        share = (choices[40:] != 0).float().mean().item()  # once stretches have had time to overlap with any step
-        assert share == pytest.approx(epsilon * (1 - 1 / self.ACTIONS), abs=0.006)
-
-    def test_an_action_is_repeated_while_its_stretch_lasts(self):
-        choices, carried = self.play(RepeatingEpsilonGreedy(0.3, 0.3), steps=60)
-        before, after = carried[:-1], carried[1:]
-        going_on = before[..., 1] > 0
-        assert going_on.any() and (choices == before[..., 0])[going_on].all()
-        assert (after[..., 1] == before[..., 1] - 1)[going_on].all()
-        assert (after[..., 0] == before[..., 0])[going_on].all()
-        begun = ~going_on & (after[..., 1] > 0)
-        assert begun.any() and (choices == after[..., 0])[begun].all()
-        assert ((choices == 0) | (choices == after[..., 0]))[~going_on].all()
-
-    @pytest.mark.parametrize(("exponent", "max_repeats"), [(2.0, 15), (1.0, 4), (2.0, 1)])
-    def test_lengths_of_stretches(self, exponent, max_repeats):
-        exploration = RepeatingEpsilonGreedy(1.0, 1.0, exponent=exponent, max_repeats=max_repeats)
-        _, carried = self.play(exploration, steps=100)
-        lengths = carried[1:, :, 1][carried[:-1, :, 1] == 0] + 1
-        counts = lengths.bincount(minlength=max_repeats + 1)[1:].double()
-        weights = torch.arange(1, max_repeats + 1).double() ** -exponent
-        expected = len(lengths) * weights / weights.sum()
-        assert len(counts) == max_repeats and len(lengths) > 20_000
-        chi_square = ((counts - expected) ** 2 / expected).sum().item()
-        assert chi_square < max_repeats + 6 * (2 * max_repeats) ** 0.5
-
-    def test_random_actions_are_uniform(self):
-        choices, _ = self.play(RepeatingEpsilonGreedy(1.0, 1.0, max_repeats=2))
-        shares = choices.flatten().bincount(minlength=self.ACTIONS) / choices.numel()
-        assert shares.tolist() == pytest.approx([1 / self.ACTIONS] * self.ACTIONS, rel=0.15)
-
-    @pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.MODE, ExplorationType.MEAN])
-    def test_any_other_exploration_type_is_greedy_and_drops_the_stretch(self, kind):
-        with set_exploration_type(kind):
-            choice, carried = RepeatingEpsilonGreedy(1.0, 1.0).extend(VALUES.expand(5, 4), torch.full((5, 2), 3))
-        assert (choice == 1).all() and (carried == 0).all()
-
-    def test_a_single_environment_without_batch(self):
-        with set_exploration_type(ExplorationType.RANDOM):
-            choice, carried = RepeatingEpsilonGreedy(0.0, 0.0).extend(VALUES, torch.tensor([2, 5]))
-        assert choice.item() == 2 and carried.tolist() == [2, 4]
-
-    def test_the_ladder_gives_each_environment_its_share(self):
-        choices, _ = self.play(RepeatingEpsilonGreedy(0.5, 0.5, ladder=2.0), num_envs=1_001)
-        shares = (choices[40:] != 0).float().mean(0)
-        assert shares[:100].mean().item() == pytest.approx(0.47, abs=0.03)
-        assert shares[-100:].mean().item() == pytest.approx(0.13, abs=0.03)
-
-    def test_a_stretch_ends_where_an_option_starts(self):
-        carried, starts = torch.tensor([[2, 5], [2, 5], [2, 1]]), torch.tensor([False, True, False])
-        with set_exploration_type(ExplorationType.RANDOM):
-            choice, following = RepeatingEpsilonGreedy(0.0, 0.0).extend(VALUES.expand(3, 4), carried, None, starts)
-        assert choice.tolist() == [2, 1, 2] and following[:, 1].tolist() == [4, 0, 0]
-
-    def test_a_fixed_epsilon_holds_for_stretches_too(self):
-        exploration = RepeatingEpsilonGreedy(1.0, 1.0, ladder=3.0)
-        exploration.fixed = 0.25
-        choices, _ = self.play(exploration)
-        assert (choices[40:] != 0).float().mean().item() == pytest.approx(0.25, abs=0.02)
-
-    @pytest.mark.parametrize(
-        ("arguments", "message"),
-        [
-            ({"start": 2.0}, r"start must be an epsilon in \[0, 1\], got 2.0; "),
-            ({"exponent": 0.0}, "exponent must be > 0 and finite, got 0.0; "),
-            ({"max_repeats": 0}, "max_repeats must be >= 1, got 0; "),
-        ],
-    )
-    def test_wrong_values(self, arguments, message):
-        with pytest.raises(ValueError, match=message):
-            RepeatingEpsilonGreedy(**arguments)
+    steps = agent.transform(env).rollout(100, agent.policy, break_when_any_done=False)
+    chosen = steps["action" if level == "sub" else "subgoal"]
+    carried = steps["repeated_action" if level == "sub" else "subgoal_exploration"].squeeze(-1)
+    due = torch.ones_like(steps["is_init"]) if level == "sub" else steps["option_init"]
+    due, size = due.squeeze(-1), 4 if level == "sub" else 2
+    assert (chosen == carried % size)[due].all()
+    before, after = carried[:, :-1], carried[:, 1:]
+    fresh = steps["is_init"][:, 1:].squeeze(-1)
+    assert (after == torch.where(fresh, 0, before + due[:, :-1])).all() and carried.max() > 1

@@ -3,6 +3,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import ExplorationType, set_exploration_type
 
+from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.modules import SubgoalSuccess, SuccessEpsilonGreedy
 
 
@@ -57,7 +58,7 @@ class TestSuccessEpsilonGreedy:
         values[:, 0] = 1.0
         subgoal = torch.full((2000,), subgoal)
         with set_exploration_type(ExplorationType.RANDOM):
-            action, _ = exploration.extend(values, torch.zeros(2000, 2, dtype=torch.int64), subgoal)
+            action, _ = exploration(values, condition=subgoal)
         return (action != 0).float().mean().item() * 50 / 49
 
     def test_epsilon_of_each_subgoal(self):
@@ -82,6 +83,15 @@ class TestSuccessEpsilonGreedy:
         exploration.observe(batch(WON, WON, WON, LOST))
         other.load_state_dict(exploration.state_dict())
         assert other.epsilons(torch.zeros(1), torch.tensor([0])).item() == pytest.approx(0.25)
+
+    def test_it_reads_the_entries_of_the_set_of_subgoals_that_it_is_given(self):
+        exploration = SuccessEpsilonGreedy()
+        exploration.set_num_subgoals(2, names=OptionKeys("rooms"))
+        steps = batch(WON)
+        for key in ("active_subgoal", "option_done", "subgoal_reached"):
+            steps.rename_key_(("next", key), ("next", f"rooms_{key}"))
+        exploration.observe(steps)
+        assert exploration.success.rates.tolist() == [1.0, 0.0]
 
     def test_the_schedule_counts_too(self):
         exploration = SuccessEpsilonGreedy(1.0, 0.1, anneal_frames=100)

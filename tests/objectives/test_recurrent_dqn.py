@@ -22,7 +22,13 @@ SUB_KEYS = {
     "terminated": "option_terminated",
     "init": "option_init",
 }
-META_KEYS = {"action": "subgoal", "reward": "option_return", "steps": "option_steps", "action_mask": "subgoal_mask"}
+META_KEYS = {
+    "action_value": "subgoal_value",
+    "action": "subgoal",
+    "reward": "option_return",
+    "steps": "option_steps",
+    "action_mask": "subgoal_mask",
+}
 
 
 def make_controller(level="flat", *, recurrent=True):
@@ -386,7 +392,8 @@ class TestLeaks:
         changed = sample.clone()
         changed["observation"][0] += 1.0
         with set_recurrent_mode(True):
-            before, after = controller(sample.clone())["action_value"], controller(changed)["action_value"]
+            key = controller.action_value_key
+            before, after = controller(sample.clone())[key], controller(changed)[key]
         assert (before[0] != after[0]).all()
         assert (before[1:] == after[1:]).all()
 
