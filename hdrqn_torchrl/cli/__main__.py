@@ -1,28 +1,28 @@
-"""The command ``hdrqn``: one word for each program."""
+"""The command ``hdrqn``: one word for each program, then what the program itself takes."""
 
 from __future__ import annotations
 
 import sys
 from importlib import import_module
 
-PROGRAMS = ("train", "evaluate", "watch", "plot", "report")
-USAGE = f"usage: hdrqn {'|'.join(PROGRAMS)} [key=value ...]; `hdrqn PROGRAM --help` explains each."
+from hdrqn_torchrl import __version__
+from hdrqn_torchrl.runs.commands import PROGRAMS
+
+USAGE = f"usage: hdrqn {'|'.join(PROGRAMS)} [key=value ...]; `hdrqn PROGRAM --help` explains each"
 
 
 def main() -> None:
     """Runs the program that the first argument names with the others."""
     program = sys.argv[1] if len(sys.argv) > 1 else ""
-    if program in ("--version", "-V"):
-        from hdrqn_torchrl import __version__
-
+    if program in PROGRAMS:
+        sys.argv = [f"hdrqn {program}", *sys.argv[2:]]
+        import_module(f"hdrqn_torchrl.cli.{program}").main()
+    elif program in ("-V", "--version"):
         print(__version__)
-        return
-    if program not in PROGRAMS:
-        helped = program in ("-h", "--help")
-        print(USAGE, file=sys.stdout if helped else sys.stderr)
-        sys.exit(0 if helped else 2)
-    sys.argv = [f"hdrqn {program}", *sys.argv[2:]]
-    import_module(f"hdrqn_torchrl.cli.{program}").main()
+    elif program in ("-h", "--help"):
+        print(USAGE)
+    else:
+        sys.exit(USAGE if not program else f"error: the program must be one of {', '.join(PROGRAMS)}, got {program!r}.")
 
 
 if __name__ == "__main__":

@@ -11,8 +11,9 @@ import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from hdrqn_torchrl.runs.commands import command_of
+
 TARGET = "_target_"
-REMEDY = "`python train.py --cfg job` shows every setting and its default"
 _IN_WORDS: dict[Any, str] = {
     type(None): "null", bool: "true or false", int: "an integer", float: "a finite number", str: "a text",
 }  # fmt: skip
@@ -35,17 +36,22 @@ def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
         >>> check_arguments({"_target_": "epsilon", "start": "high"}, "exploration", lambda _: EpsilonGreedy)
         Traceback (most recent call last):
         ...
-        ValueError: exploration.start must be a finite number, got 'high'; `python train.py --cfg job` shows every setting and its default.
-    """  # noqa: E501
+        ValueError: exploration.start must be a finite number, got 'high'; `...` shows every setting and its default.
+    """
     if not isinstance(node, Mapping) or not isinstance(node.get(TARGET), str):
-        raise ValueError(f"{path} must be settings with a {TARGET}, got {shown(node)}; {REMEDY}.")
+        raise ValueError(f"{path} must be settings with a {TARGET}, got {shown(node)}; {remedy()}.")
     hints = annotations_of(locate(node[TARGET]))
     for name, value in _settings(node):
         full = f"{path}.{name}"
         if isinstance(value, Mapping) and TARGET in value:
             check_arguments(value, full, locate)
         elif name in hints and not fits(value, hints[name]):
-            raise ValueError(f"{full} must be {in_words(hints[name])}, got {shown(value)}; {REMEDY}.")
+            raise ValueError(f"{full} must be {in_words(hints[name])}, got {shown(value)}; {remedy()}.")
+
+
+def remedy() -> str:
+    """What helps against a wrong setting, for messages."""
+    return f"`{command_of('train')} --cfg job` shows every setting and its default"
 
 
 def _settings(node: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:

@@ -14,7 +14,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from hdrqn_torchrl.cli.arguments import check_arguments
+from hdrqn_torchrl.cli.arguments import check_arguments, remedy
 from hdrqn_torchrl.runs.stored_settings import check_plain
 
 if TYPE_CHECKING:
@@ -231,4 +231,4 @@ def explain(error: Exception) -> str:
         return str(cause)
     if isinstance(cause, ValueError):
         return f"{path}.{cause}" if path else str(cause)
-    return f"{path}: {cause or error}; `python train.py --cfg job` shows every setting and its default."
+    return f"{path}: {cause or error}; {remedy()}."

@@ -18,8 +18,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 import hdrqn_torchrl
-from hdrqn_torchrl.cli.arguments import shown
+from hdrqn_torchrl.cli.arguments import remedy, shown
 from hdrqn_torchrl.cli.building import SettingsError, build_algorithm, build_env, check_targets, explain, plain
+from hdrqn_torchrl.runs.commands import as_called
 from hdrqn_torchrl.runs.files import RunFileError, read_json
 from hdrqn_torchrl.runs.stored_settings import read_settings
 
@@ -111,9 +112,7 @@ def check(config: DictConfig) -> None:
         (config.checkpoint, CheckpointSchema),
     ):
         if unknown := set(section) - {known.name for known in fields(schema)}:  # added with +
-            raise SettingsError(
-                f"{min(unknown)} must be a known setting; `python train.py --cfg job` shows all of them."
-            )
+            raise SettingsError(f"{min(unknown)} must be a known setting; {remedy()}.")
     for key, least, most in (
         ("total_frames", 1, 10**15),
         ("threads", 1, 1_024),
@@ -176,7 +175,7 @@ def read_config(folder: Path) -> DictConfig:
     path = folder / "config.yaml"
     if not path.is_file():
         raise SettingsError(
-            f"run must be a folder that train.py wrote, got {folder}, which has no config.yaml; "
+            f"run must be the folder of a training, got {folder}, which has no config.yaml; "
             "the default place of runs is outputs/."
         )
     try:
@@ -296,7 +295,7 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
     """
     arguments = sys.argv[1:]
     if {"-h", "--help"} & set(arguments) or not arguments:
-        print(doc.strip())
+        print(as_called(doc.strip()))
         sys.exit(0 if arguments else 2)
     try:
         if wrong := [argument for argument in arguments if "=" not in argument]:

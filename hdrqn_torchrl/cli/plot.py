@@ -141,7 +141,7 @@ def read_entries(patterns: list[str]) -> list[Entry]:
     if not folders:
         raise SettingsError(
             f"runs must match at least one folder with a metrics.csv, got {', '.join(patterns)}, looked up in "
-            f"{Path.cwd()}; train.py writes to outputs/ by default."
+            f"{Path.cwd()}; trainings write to outputs/ by default."
         )
     entries = []
     for folder in folders:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-import re
+import os
 import shlex
 import subprocess
 import sys
@@ -14,11 +14,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from hdrqn_torchrl.cli.building import plain
 from hdrqn_torchrl.cli.configuration import SettingsError, check, read_choices, read_config
+from hdrqn_torchrl.runs.commands import command_of
+from hdrqn_torchrl.runs.stored_settings import INTERPOLATION
 
 FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets", "evaluation.ceilings")
 """Settings that may differ when a run is resumed: they don't change what is learned."""
@@ -52,7 +57,9 @@ def plan(config: DictConfig, folder: Path) -> Plan:
         SettingsError: if a run would be overwritten, or resumed with other settings.
     """
     choices = dict(HydraConfig.get().runtime.choices)
+    refuse_other_algorithm(choices)
     if config.resume is None:
+        refuse_reference(folder)
         if holds_run(folder):
             raise SettingsError(
                 f"{folder} already holds a run, which would be overwritten; `{command(folder, config)}` goes on "
@@ -79,15 +86,55 @@ def plan(config: DictConfig, folder: Path) -> Plan:
     return Plan(run, config, read_choices(run) or choices, resumed=True, checkpoint=checkpoint)
 
 
+def refuse_reference(folder: Path) -> None:
+    """Ends the program if a new run could not be named afterwards."""
+    if INTERPOLATION in os.path.relpath(folder):
+        raise SettingsError(
+            f"hydra.run.dir must be a folder without {INTERPOLATION} in its name, got {folder}; that is how references "
+            "begin, so nothing could name it afterwards."
+        )
+
+
+def refuse_other_algorithm(choices: dict[str, str]) -> None:
+    """Ends the program if a variant of one algorithm was given with another one.
+
+    Args:
+        choices: files of conf/ by group.
+    """
+    variant = choices.get("variant")
+    for source in HydraConfig.get().runtime.config_sources if variant else ():
+        path = Path(source.path) / "variant" / f"{variant}.yaml"
+        if source.schema == "file" and path.is_file():
+            defaults = yaml.safe_load(path.read_text()).get("defaults", ())
+            own = [each["override /algo"] for each in defaults if isinstance(each, dict) and "override /algo" in each]
+            if own and own[0] != choices["algo"]:
+                raise SettingsError(
+                    f"variant={variant} must be given with its own algorithm, {own[0]}, got algo={choices['algo']}; "
+                    "leave algo out."
+                )
+
+
 def command(folder: Path, config: DictConfig) -> str:
     """What goes on with a run, as it is to be typed: quoted for the shell and for Hydra, with what one must trust."""
     value = str(folder)
-    if re.fullmatch(r"[\w ./:-]+", value, re.ASCII) is None:
+    if INTERPOLATION in value:
+        value = os.path.relpath(folder)
+    if value == "auto":
+        value = "./auto"
+    if not _is_read_as_it_stands(value):
         value = '"' + value.replace('"', '\\"') + '"'
     words = [f"resume={value}"]
     if targets := list(config.get("allowed_targets") or ()):
         words.append(f"allowed_targets=[{','.join(map(str, targets))}]")
-    return shlex.join(["python", "train.py", *words])
+    return f"{command_of('train')} {shlex.join(words)}"
+
+
+def _is_read_as_it_stands(value: str) -> bool:
+    """Whether Hydra takes a value for the text that it is; ``null``, ``007`` and ``a,b`` it does not."""
+    try:
+        return OverridesParser.create().parse_override(f"resume={value}").value() == value
+    except HydraException:
+        return False
 
 
 def holds_run(folder: Path) -> bool:
@@ -238,11 +285,14 @@ def record(run: Plan) -> None:
 
 
 def _commit() -> str | None:
-    """Commit of this program's files, if they are in a git repository."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=10"]
+    """Commit of this program's files, if they are part of a git repository."""
     try:
-        return subprocess.run(
-            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-        ).stdout.strip()
+        _git("ls-files", "--error-unmatch", Path(__file__).name)  # in a repository an installed package may lie, too
+        return _git("describe", "--always", "--dirty", "--abbrev=10")
     except (OSError, subprocess.CalledProcessError):
         return None
+
+
+def _git(*arguments: str) -> str:
+    folder = Path(__file__).parent
+    return subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True).stdout.strip()

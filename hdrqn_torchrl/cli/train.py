@@ -91,7 +91,7 @@ def in_words(run: Plan) -> Iterator[None]:
     except (CheckpointError, NonFiniteError) as error:
         raise RunError(str(error)) from error
     except OSError as error:
-        remedy = f"mend that, then `{command(run.folder, run.config)}` goes on from the last checkpoint"
+        remedy = f"when that is fixed, `{command(run.folder, run.config)}` goes on from the last checkpoint"
         raise RunError(f"{error}; {remedy}.") from error
 
 

@@ -3,7 +3,7 @@
     python watch.py run=RUN_DIR out=episode.gif
     python watch.py run=RUN_DIR out=terminal env.layout=four_rooms epsilon=0.1
 
-run              folder that train.py wrote
+run              folder of a training
 out              what to write, by ending: .gif or .mp4 (needs PyAV), or terminal to watch at once (default episode.gif)
 episodes         how many, one after the other (default 3)
 seed             of worlds and exploration; the same seed shows the same episodes (default 0)

@@ -278,9 +278,7 @@ class TestLoadAgent:
 
     def test_what_is_no_run(self, run, tmp_path):
         for folder in (tmp_path, tmp_path / "nothing", run / "config.yaml"):
-            with pytest.raises(
-                SettingsError, match=r"^run must be a folder that train\.py wrote, got .* no config\.yaml; "
-            ):
+            with pytest.raises(SettingsError, match=r"^run must be the folder of a training, got .* no config\.yaml; "):
                 load_agent(folder)
 
     def test_a_run_that_has_saved_nothing(self, tmp_path):
@@ -334,7 +332,7 @@ class TestReadConfig:
 
     def test_a_folder_in_its_place(self, tmp_path):
         (tmp_path / "config.yaml").mkdir()
-        with pytest.raises(SettingsError, match=r"run must be a folder that train\.py wrote"):
+        with pytest.raises(SettingsError, match=r"run must be the folder of a training"):
             read_config(tmp_path)
 
 

@@ -100,7 +100,7 @@ def test_the_object_can_be_written_to_a_file(call, tmp_path):
             r"env.view=3 must leave .*, but observation is uint8 \[3, 3\] below 5 instead",
         ),
         (["checkpoint=nowhere"], "nowhere"),
-        (["run=nowhere"], "run must be a folder that train.py wrote, got nowhere"),
+        (["run=nowhere"], "run must be the folder of a training, got nowhere"),
         (["episodes=8", "out=/dev/null/result.json"], "out must be a file that can be written"),
         (["episodes=8", "figures=/dev/null/figures"], "figures must be a file that can be written"),
         (["episodes"], "must read key=value, got 'episodes'"),

@@ -75,13 +75,38 @@ class TestANewRun:
         ):
             plan_for(folder=folder)
 
-    @pytest.mark.parametrize("name", ["run", "a b", "a#b", "a=b,c", "(a) [b]", "jörg's", 'a"b', "~a", "@a%b"])
+    @pytest.mark.parametrize(
+        "name",
+        ["run", "a b", "a#b", "a=b,c", "(a) [b]", "jörg's", 'a"b', "~a", "@a%b", "null", "true", "1e3", "007"],
+    )
     def test_the_command_that_goes_on_can_be_typed_as_it_is_printed(self, name):
         config = OmegaConf.create({"allowed_targets": ["mine.Env", "mine.network"]})
         words = shlex.split(command(Path(name), config))
         resume, allowed = OverridesParser.create().parse_overrides(words[2:])
         assert words[:2] == ["python", "train.py"]
         assert str(resume.value()) == name and allowed.value() == ["mine.Env", "mine.network"]
+
+    def test_a_folder_called_auto_is_not_taken_for_the_newest_run(self):
+        assert command(Path("auto"), OmegaConf.create({})) == "python train.py resume=./auto"
+
+    def test_a_folder_that_would_be_a_reference_is_named_from_here(self, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "${here}").mkdir()
+        monkeypatch.chdir(tmp_path / "${here}")
+        assert command(Path.cwd() / "out", OmegaConf.create({})) == "python train.py resume=out"
+
+    def test_or_refused_if_it_is_one_from_here_too(self):
+        with pytest.raises(
+            SettingsError, match=r"^hydra\.run\.dir must be a folder without \$\{ in its name, got a\$\{b"
+        ):
+            plan_for(folder="a${b}")
+
+    def test_a_variant_of_another_algorithm_is_refused(self):
+        with pytest.raises(
+            SettingsError, match=r"^variant=v2_lambda must be given with its own algorithm, v2, got algo=v3"
+        ):
+            plan_for("variant=v2_lambda", "algo=v3")
+        assert plan_for("variant=v2_lambda", "algo=v2").choices["algo"] == "v2"
 
     def test_the_command_that_goes_on_names_no_builders_where_none_were_added(self):
         assert command(Path("out/run"), OmegaConf.create({})) == "python train.py resume=out/run"
@@ -180,9 +205,7 @@ class TestResumingAFolder:
 
     @pytest.mark.parametrize("folder", ["nowhere", "outputs"])
     def test_what_is_no_run_is_refused(self, folder):
-        with pytest.raises(
-            SettingsError, match=rf"^run must be a folder that train\.py wrote, got {folder}, which has no"
-        ):
+        with pytest.raises(SettingsError, match=rf"^run must be the folder of a training, got {folder}, which has no"):
             plan_for(f"resume={folder}")
 
     def test_a_wrong_value_is_told(self):

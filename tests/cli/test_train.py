@@ -475,7 +475,7 @@ class TestFailures:
         code, _, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=fill_disk_at_next_row)
         assert code == 1 and "Traceback" not in told
         line = told.strip().splitlines()[-1]
-        assert "File too large" in line and "then `python train.py resume=run` goes on from the last checkpoint" in line
+        assert "File too large" in line and "when that is fixed, `python train.py resume=run` goes on" in line
 
     def test_a_number_that_is_none(self, a_run):
         code, printed, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=poison_updates)

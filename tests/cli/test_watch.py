@@ -135,7 +135,7 @@ def test_stopping_to_watch_is_no_error(run, command, monkeypatch):
         (["env.view=4"], "view must be an odd number of cells"),
         (["checkpoint=nowhere"], "error: checkpoint"),
         (["speed=3"], "the settings are run, out, episodes"),
-        (["run=."], "error: run must be a folder that train.py wrote"),
+        (["run=."], "error: run must be the folder of a training"),
     ],
     ids=str,
 )
