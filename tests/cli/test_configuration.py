@@ -151,6 +151,7 @@ def test_one_precision_for_all_learners(name):
     [
         (["env=gridworld", "algo=v3"], -0.5),  # where goals have an order
         (["env=four_rooms", "algo=v3"], -0.5),
+        (["env=nine_rooms", "algo=v3"], -0.5),
         (["variant=v3"], -0.5),
         (["variant=v3_free_passage"], 0.0),
         (["env=gridworld", "algo=v3", "algo.wrong_subgoal_reward=-0.25"], -0.25),

@@ -11,7 +11,7 @@ from hdrqn_torchrl.envs.grid.cells import AGENT_COLOUR, palette
 from hdrqn_torchrl.envs.grid.drawing import draw_worlds
 from hdrqn_torchrl.envs.gym import MultiGoalGymEnv
 
-IDS = {"hdrqn/Gridworld-v0": "open", "hdrqn/FourRooms-v0": "four_rooms"}
+IDS = {"hdrqn/Gridworld-v0": "open", "hdrqn/FourRooms-v0": "four_rooms", "hdrqn/NineRooms-v0": "nine_rooms"}
 CORRIDOR = {"layout": ("######", "#    #", "######"), "num_obstacles": 1, "num_goals": 2}  # cells 7 to 10
 RIGHT = 3
 
@@ -32,8 +32,9 @@ def test_passes_the_checker_without_a_warning(env_id, settings):
         {"layout": "open", "num_goals": 2, "view": 5},
         {"layout": "four_rooms", "num_goals": 3, "view": None},
         {"layout": ("    ", " #  ", "    "), "num_goals": 3, "view": 3, "max_steps": 30},
+        {"layout": "nine_rooms", "max_steps": 150},
     ],
-    ids=["open", "rooms", "small"],
+    ids=["open", "rooms", "small", "nine_rooms"],
 )
 def test_equals_the_batched_environment_step_for_step(settings, obstacle):
     batched = MultiGoalGridEnv(1, seed=0, obstacle=obstacle, **settings)
@@ -54,7 +55,9 @@ def test_equals_the_batched_environment_step_for_step(settings, obstacle):
             observation, reward, terminated, truncated, info = single.step(action)
             done, steps = terminated or truncated, steps + 1
             assert (observation == tensordict["observation"][0].numpy()).all()
-            assert (info["attained"] == tensordict["attained"][0].numpy()).all()
+            for key in ("attained", "rooms_attained", "rooms_available"):
+                assert (key in info) == (key in tensordict)
+                assert key not in info or (info[key] == tensordict[key][0].numpy()).all()
             scalars = (reward, info["extrinsic_reward"], terminated, truncated, info["hazard"], info["is_success"])
             names = ("reward", "extrinsic_reward", "terminated", "truncated", "hazard", "success")
             assert scalars == tuple(tensordict[name].item() for name in names)

@@ -60,7 +60,7 @@ class TestWhatIsFound:
         task = task_of(TransformedEnv(small_env(2), RewardScaling(0.0, 5.0)))
         assert task == replace(grid, largest_return=math.inf)
         task = task_of(TransformedEnv(small_env(2), RewardScaling(0.0, 5.0, in_keys=["extrinsic_reward"])))
-        assert task == Task(max_steps=grid.max_steps, largest_return=grid.largest_return)
+        assert task == Task(max_steps=grid.max_steps, largest_return=grid.largest_return, subgoals=grid.subgoals)
         assert task_of(TransformedEnv(small_env(2), RewardSum(["reward"], ["episode_reward"]))) == grid
 
     def test_gymnasium_s_time_limit_is_known(self):

@@ -16,14 +16,25 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules, GridState, StepEvents
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
-from hdrqn_torchrl.envs.task import GoalsInOrder, Task
+from hdrqn_torchrl.envs.task import GoalsInOrder, SubgoalSet, Task
+
+ROOMS = keys.OptionKeys("rooms")  # of rooms and doors
+
+
+def subgoals_of(rules: GridRules) -> tuple[SubgoalSet, ...]:
+    """The sets of subgoals of a grid task, from near to far: rooms and doors if they are any, and the goals."""
+    goals = SubgoalSet(names=tuple(f"goal {index + 1}" for index in range(rules.num_goals)))
+    if rules.places is None:
+        return (goals,)
+    return SubgoalSet(names=rules.places.names, prefix=ROOMS.prefix, repeatable=True), goals
 
 
 class MultiGoalGridEnv(EnvBase):
     """Goals to be reached in order on a grid, seen through a window around the agent (section IV of the paper).
 
     **Description.** Agent, two obstacles and K goals stand on distinct random free cells of an 11x11 map
-    ("open", or "four_rooms" with inner walls and four doors). ``num_envs`` worlds step together as tensors.
+    ("open", or "four_rooms" with inner walls and four doors). "nine_rooms" has 17x17 cells, 3x3 rooms and twelve doors;
+    there all goals lie in other rooms than the agent's start. ``num_envs`` worlds step together as tensors.
 
     **Actions.** 0 up, 1 down, 2 left, 3 right; a wall stops the move.
 
@@ -31,19 +42,22 @@ class MultiGoalGridEnv(EnvBase):
     outside, 2 obstacle, 3 + k goal k.
 
     **Reward.** ``reward``: -1 on an obstacle, +1 for each goal in order, 0.01 for a goal out of order.
-    ``extrinsic_reward``: the same without the obstacle's penalty. Beside them: ``attained`` ``[K]`` (goals
+    ``extrinsic_reward``: the same without the obstacle's penalty. Besides these: ``attained`` ``[K]`` (goals
     reached by this step), ``hazard`` (obstacle hit), ``success`` (last goal reached, all in order).
+    With ``places`` there are nearer subgoals, too: ``rooms_attained`` ``[N, places]`` (the room or door entered by this
+    step) and ``rooms_available`` (all but the one where the agent is); ``task.subgoals`` has their names.
 
     **End of episode.** All goals collected: terminated. ``max_steps`` steps: truncated.
 
     Args:
         num_envs: number of worlds N; it is the batch size ``[N]``.
-        layout: ``"open"``, ``"four_rooms"``, or the rows of a map (``#`` is wall).
+        layout: ``"open"``, ``"four_rooms"``, ``"nine_rooms"``, or the rows of a map (``#`` is wall).
         num_goals: K >= 1.
         view: side of the window in cells (odd), or ``None`` for the whole map, agent-centred.
         max_steps: step limit of an episode.
         obstacle: ``"stay"`` or ``"teleport"`` (a hit obstacle moves to a random free cell).
         num_obstacles: number of obstacles.
+        places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
         seed: seed of the layouts; ``None`` draws one from torch's global generator.
         device: device of all tensors.
 
@@ -69,6 +83,7 @@ class MultiGoalGridEnv(EnvBase):
         max_steps: int = 50,
         obstacle: Literal["stay", "teleport"] = "stay",
         num_obstacles: int = 2,
+        places: bool | None = None,
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
@@ -79,7 +94,13 @@ class MultiGoalGridEnv(EnvBase):
         device = torch.device(device or "cpu")
         super().__init__(device=device, batch_size=(num_envs,))
         self.rules = GridRules(
-            layout, num_goals=num_goals, view=view, obstacle=obstacle, num_obstacles=num_obstacles, device=device
+            layout,
+            num_goals=num_goals,
+            view=view,
+            obstacle=obstacle,
+            num_obstacles=num_obstacles,
+            places=places,
+            device=device,
         )
         self.num_envs, self.max_steps = num_envs, max_steps
         self.settings: dict[str, Any] = {
@@ -96,6 +117,7 @@ class MultiGoalGridEnv(EnvBase):
             largest_extrinsic_return=float(num_goals),
             smallest_extrinsic_return=0.0,
             in_order=GoalsInOrder(num_goals),
+            subgoals=subgoals_of(self.rules),
         )
         self._make_specs()
         self._generator = torch.Generator(device)
@@ -107,12 +129,18 @@ class MultiGoalGridEnv(EnvBase):
         n, view, goals, device = self.num_envs, self.rules.view, self.rules.num_goals, self.device
 
         cells = Categorical(self.rules.num_codes, shape=(n, view, view), dtype=torch.uint8, device=device)
+        places = (
+            {}
+            if self.rules.places is None
+            else {key: flags(n, len(self.rules.places), device=device) for key in (ROOMS.attained, ROOMS.available)}
+        )
         self.observation_spec = Composite(
             {
                 keys.OBSERVATION: cells,
                 keys.ATTAINED: flags(n, goals, device=device),
                 keys.HAZARD: flags(n, 1, device=device),
                 keys.SUCCESS: flags(n, 1, device=device),
+                **places,
             },
             shape=(n,),
             device=device,
@@ -142,7 +170,7 @@ class MultiGoalGridEnv(EnvBase):
         state = self.rules.place(agent, objects)
         tensordict = self.reset()
         self.state = state
-        return tensordict.set(keys.OBSERVATION, self.rules.observe(self.state))
+        return tensordict.update({keys.OBSERVATION: self.rules.observe(state), **self._places(state.agent)})
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -161,6 +189,7 @@ class MultiGoalGridEnv(EnvBase):
                 keys.DONE: flag.clone(),
                 keys.TERMINATED: flag.clone(),
                 keys.TRUNCATED: flag.clone(),
+                **self._places(self.state.agent),
             },
             batch_size=self.batch_size,
             device=self.device,
@@ -179,9 +208,17 @@ class MultiGoalGridEnv(EnvBase):
         self.state = GridState(*(torch.where(expand_as_right(ended, old), new, old) for old, new in kept))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        before = self.state.agent
         self.state, events = self.rules.step(self.state, tensordict.get(keys.ACTION), self._generator)
         self.steps = self.steps + 1
-        return self._outcome(events)
+        return self._outcome(before, events)
+
+    def _places(self, before: Tensor) -> dict[str, Tensor]:
+        """What is told of rooms and doors after a step from the cells ``before``, where they are subgoals."""
+        places, agent = self.rules.places, self.state.agent
+        if places is None:
+            return {}
+        return {ROOMS.attained: places.entered(before, agent), ROOMS.available: places.elsewhere(agent)}
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """All worlds and the generator of their layouts: what a resumed run needs."""
@@ -221,7 +258,7 @@ class MultiGoalGridEnv(EnvBase):
             if (found.dtype, found.shape) != (own.dtype, own.shape) or (found < 0).any():
                 raise ValueError(f"{name} must be like {own.dtype} {list(own.shape)}; use another checkpoint.")
 
-    def _outcome(self, events: StepEvents) -> TensorDictBase:
+    def _outcome(self, before: Tensor, events: StepEvents) -> TensorDictBase:
         terminated = events.all_collected
         truncated = (self.steps >= self.max_steps) & ~terminated
         columns = {
@@ -236,4 +273,5 @@ class MultiGoalGridEnv(EnvBase):
         outcome = {key: column.unsqueeze(-1) for key, column in columns.items()}
         outcome[keys.OBSERVATION] = self.rules.observe(self.state)
         outcome[keys.ATTAINED] = events.attained
+        outcome.update(self._places(before))
         return TensorDict(outcome, batch_size=self.batch_size, device=self.device)

@@ -16,27 +16,9 @@ from torch import Tensor
 
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid.cells import FIRST_GOAL, FLOOR, OBSTACLE, WALL
+from hdrqn_torchrl.envs.grid.layouts import OF_ROOMS, map_rows
+from hdrqn_torchrl.envs.grid.places import PlacedApart, Places, find_places
 
-LAYOUTS: dict[str, tuple[str, ...]] = {
-    "open": (
-        "###########",
-        *["#         #"] * 9,
-        "###########",
-    ),
-    "four_rooms": (
-        "###########",
-        "#    #    #",
-        "#    #    #",
-        "#         #",
-        "#    #    #",
-        "### ### ###",
-        "#    #    #",
-        "#         #",
-        "#    #    #",
-        "#    #    #",
-        "###########",
-    ),
-}
 ACTIONS = ("up", "down", "left", "right")
 _MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
@@ -69,13 +51,14 @@ class GridRules:
     """Dynamics, rewards and views of the multi-goal grid tasks, for any number of worlds at once.
 
     Args:
-        layout: ``"open"``, ``"four_rooms"`` or the rows of a map (``#`` is wall, anything else is free).
+        layout: ``"open"``, ``"four_rooms"``, ``"nine_rooms"`` or the rows of a map (``#`` is wall, all else is free).
         num_goals: K, at least 1.
         view: side of the square window around the agent, an odd number of cells; ``None`` shows the whole
             map, still centred on the agent.
         obstacle: ``"stay"`` leaves a hit obstacle where it is, ``"teleport"`` moves it to a random free cell
             (as the authors' script does).
         num_obstacles: how many obstacles stand in the map.
+        places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
         device: where the tables live.
 
     Raises:
@@ -90,9 +73,10 @@ class GridRules:
         view: int | None = 5,
         obstacle: Literal["stay", "teleport"] = "stay",
         num_obstacles: int = 2,
+        places: bool | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        rows = _map_rows(layout)
+        rows = map_rows(layout)
         self.height, self.width = len(rows), len(rows[0])
         self._check_size(self.height * self.width)
         if num_goals < 1:
@@ -129,6 +113,12 @@ class GridRules:
         codes = [OBSTACLE] * num_obstacles + [FIRST_GOAL + index for index in range(num_goals)]
         self._object_codes = torch.tensor(codes, dtype=torch.uint8, device=device)
         self._goal_bits = (2 ** torch.arange(num_goals)).to(device)
+        of_rooms = isinstance(layout, str) and layout in OF_ROOMS
+        rooms = find_places(rows, device) if places or of_rooms else None
+        self.places: Places | None = None if places is False else rooms
+        self._apart: PlacedApart | None = None
+        if of_rooms and rooms is not None:
+            self._apart = PlacedApart(rooms, num_goals=num_goals, num_obstacles=num_obstacles)
 
     def _check_size(self, places: int) -> None:
         """Refuses maps and views whose tables would fill the memory."""
@@ -183,9 +173,11 @@ class GridRules:
     def sample(self, num_worlds: int, generator: torch.Generator | None = None) -> GridState:
         """Puts the agent and all objects of ``num_worlds`` new worlds on distinct random free cells."""
         device = self.free_cells.device
+        in_order = torch.ones(num_worlds, dtype=torch.bool, device=device)
+        if self._apart is not None:
+            return GridState(*self._apart(num_worlds, generator), in_order)
         order = torch.rand((num_worlds, len(self.free_cells)), generator=generator, device=device)
         picked = self.free_cells[order.topk(1 + self.num_obstacles + self.num_goals, dim=-1).indices]
-        in_order = torch.ones(num_worlds, dtype=torch.bool, device=device)
         return GridState(picked[:, 0].contiguous(), picked[:, 1:].contiguous(), in_order)
 
     def place(self, agent: Tensor, objects: Tensor) -> GridState:
@@ -279,14 +271,3 @@ class GridRules:
         maps = torch.cat([maps, maps.new_zeros(1)]).repeat(len(state.agent), 1)
         maps.scatter_(1, state.objects, self._object_codes.expand_as(state.objects))
         return maps[:, :-1].unflatten(-1, (self.height, self.width))
-
-
-def _map_rows(layout: str | Sequence[str]) -> tuple[str, ...]:
-    if isinstance(layout, str):
-        if layout not in LAYOUTS:
-            raise ValueError(f"layout must be one of {sorted(LAYOUTS)} or the rows of a map, got {layout!r}.")
-        return LAYOUTS[layout]
-    rows = tuple(layout)
-    if not rows or not rows[0] or any(len(row) != len(rows[0]) for row in rows):
-        raise ValueError(f"layout must be rows of equal length >= 1, got {list(rows)}; pad the short rows with '#'.")
-    return rows

@@ -1,4 +1,4 @@
-"""Gymnasium: importing this part registers ``hdrqn/Gridworld-v0`` and ``hdrqn/FourRooms-v0``."""
+"""Gymnasium: importing this part registers ``hdrqn/Gridworld-v0``, ``FourRooms-v0`` and ``NineRooms-v0``."""
 
 from hdrqn_torchrl.envs.gym.grid import MultiGoalGymEnv
 

@@ -1,6 +1,6 @@
 """The grid tasks as Gymnasium environments; importing this module registers their ids.
 
-``hdrqn/Gridworld-v0`` is the open map, ``hdrqn/FourRooms-v0`` the one with inner walls.
+``hdrqn/Gridworld-v0`` is the open map; ``hdrqn/FourRooms-v0`` and ``hdrqn/NineRooms-v0`` have inner walls.
 """
 
 from __future__ import annotations
@@ -11,8 +11,10 @@ from typing import Any, Literal
 import gymnasium
 import numpy as np
 import torch
+from torch import Tensor
 
 from hdrqn_torchrl.envs.grid.drawing import draw_worlds
+from hdrqn_torchrl.envs.grid.environment import ROOMS
 from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules, GridState, StepEvents
 
 
@@ -27,17 +29,19 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
     **Reward.** -1 on an obstacle, +1 for each goal in order, 0.01 for a goal out of order.
 
     **Info.** ``extrinsic_reward`` (without the obstacle's penalty), ``attained`` (``[K]`` bool, goals reached by this
-    step), ``hazard`` (obstacle hit), ``is_success`` (last goal reached, all in order).
+    step), ``hazard`` (obstacle hit), ``is_success`` (last goal reached, all in order). With ``places``:
+    ``rooms_attained`` (the room or door entered by this step) and ``rooms_available`` (all but the present one).
 
     **End of episode.** All goals collected: terminated. ``max_steps`` steps: truncated.
 
     Args:
-        layout: ``"open"``, ``"four_rooms"``, or the rows of a map (``#`` is wall).
+        layout: ``"open"``, ``"four_rooms"``, ``"nine_rooms"``, or the rows of a map (``#`` is wall).
         num_goals: K >= 1.
         view: side of the window in cells (odd), or ``None`` for the whole map, agent-centred.
         max_steps: step limit of an episode.
         obstacle: ``"stay"`` or ``"teleport"`` (a hit obstacle moves to a random free cell).
         num_obstacles: number of obstacles.
+        places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
         render_mode: ``"rgb_array"`` or ``None``.
 
     Raises:
@@ -63,6 +67,7 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
         max_steps: int = 50,
         obstacle: Literal["stay", "teleport"] = "stay",
         num_obstacles: int = 2,
+        places: bool | None = None,
         render_mode: Literal["rgb_array"] | None = None,
     ) -> None:
         if max_steps < 1:
@@ -71,7 +76,9 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
             raise ValueError(
                 f"render_mode must be 'rgb_array' or None, got {render_mode!r}; use 'rgb_array' for frames."
             )
-        self.rules = GridRules(layout, num_goals=num_goals, view=view, obstacle=obstacle, num_obstacles=num_obstacles)
+        self.rules = GridRules(
+            layout, num_goals=num_goals, view=view, obstacle=obstacle, num_obstacles=num_obstacles, places=places
+        )
         self.max_steps, self.render_mode = max_steps, render_mode
         window = (self.rules.view, self.rules.view)
         self.observation_space = gymnasium.spaces.Box(0, self.rules.num_codes - 1, window, np.uint8)
@@ -103,7 +110,8 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
         self.steps = 0
         none = torch.zeros(1)
         never, attained = none.bool(), torch.zeros((1, self.rules.num_goals), dtype=torch.bool)
-        return self._observation(), _info(StepEvents(none, none, never, attained, never, never))
+        events = StepEvents(none, none, never, attained, never, never)
+        return self._observation(), self._info(self.state.agent, events)
 
     def step(self, action: np.int64 | int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Moves the agent once.
@@ -122,11 +130,12 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
             raise gymnasium.error.ResetNeeded("step needs an episode; call reset() first.")
         if not self.action_space.contains(action):
             raise ValueError(f"action must be an integer from 0 to {len(ACTIONS) - 1} {ACTIONS}, got {action!r}.")
+        before = self.state.agent
         self.state, events = self.rules.step(self.state, torch.tensor([int(action)]), self._generator)
         self.steps += 1
         terminated = bool(events.all_collected)
         truncated = self.steps >= self.max_steps and not terminated
-        return self._observation(), events.reward.item(), terminated, truncated, _info(events)
+        return self._observation(), events.reward.item(), terminated, truncated, self._info(before, events)
 
     def render(self) -> np.ndarray | None:
         """Draws the map, dimmed where the agent does not see it: ``[height, width, 3]`` uint8, or None without mode."""
@@ -148,16 +157,21 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
         assert self.state is not None
         return self.rules.observe(self.state)[0].numpy()
 
-
-def _info(events: StepEvents) -> dict[str, Any]:
-    return {
-        "extrinsic_reward": events.extrinsic_reward.item(),
-        "attained": events.attained[0].numpy(),
-        "hazard": bool(events.hazard),
-        "is_success": bool(events.success),
-    }
+    def _info(self, before: Tensor, events: StepEvents) -> dict[str, Any]:
+        assert self.state is not None
+        info = {
+            "extrinsic_reward": events.extrinsic_reward.item(),
+            "attained": events.attained[0].numpy(),
+            "hazard": bool(events.hazard),
+            "is_success": bool(events.success),
+        }
+        if (places := self.rules.places) is not None:
+            info[ROOMS.attained] = places.entered(before, self.state.agent)[0].numpy()
+            info[ROOMS.available] = places.elsewhere(self.state.agent)[0].numpy()
+        return info
 
 
 _ENTRY_POINT = f"{__name__}:{MultiGoalGymEnv.__name__}"  # as a string, so that specs can be written as JSON
 gymnasium.register(id="hdrqn/Gridworld-v0", entry_point=_ENTRY_POINT, kwargs={"layout": "open"})
 gymnasium.register(id="hdrqn/FourRooms-v0", entry_point=_ENTRY_POINT, kwargs={"layout": "four_rooms"})
+gymnasium.register(id="hdrqn/NineRooms-v0", entry_point=_ENTRY_POINT, kwargs={"layout": "nine_rooms", "max_steps": 150})

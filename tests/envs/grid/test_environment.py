@@ -186,6 +186,7 @@ def test_set_world_wants_one_world_for_each_row():
         ({"max_steps": 2}, lambda env: env.rollout(5, break_when_any_done=False)["next", "truncated"].any()),
         ({"obstacle": "teleport"}, lambda env: env.rules.teleport),
         ({"num_obstacles": 5}, lambda env: (env.rules.whole_map(env.state) == 2).sum(dim=(1, 2))[0]),
+        ({"layout": "four_rooms", "places": True}, lambda env: len(env.task.subgoals)),
         ({"seed": 1}, lambda env: env.state.agent.sum()),
     ],
     ids=str,

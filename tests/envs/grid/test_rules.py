@@ -4,7 +4,8 @@ import pytest
 import torch
 
 from hdrqn_torchrl.envs.grid.cells import FIRST_GOAL, FLOOR, OBSTACLE, WALL
-from hdrqn_torchrl.envs.grid.rules import ACTIONS, LAYOUTS, GridRules
+from hdrqn_torchrl.envs.grid.layouts import LAYOUTS
+from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules
 
 UP, DOWN, LEFT, RIGHT = range(4)
 SMALL = ("#####", "#   #", "# # #", "#   #", "#####")  # eight free cells: goals are met often, in every order
