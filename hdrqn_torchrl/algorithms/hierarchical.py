@@ -26,7 +26,7 @@ from hdrqn_torchrl.data import (
 from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learning import Extract, Learner, LearnerSettings, PhaseOne, Phases
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
-from hdrqn_torchrl.transforms import SubgoalTransform, largest_intrinsic_return
+from hdrqn_torchrl.transforms import IntrinsicReward, SubgoalTransform
 
 LONGEST_HELD_EPISODE = 1_000
 """Steps of the longest episode whose options are stored all at once, when it is over."""
@@ -155,12 +155,12 @@ def make_hdrqn(
     if refresh_steps is not None:
         refresh = partial(refresh_hidden, sub_controller, refresh_steps, read_last_observation=reads_last)
     relabel, root_extra, next_extra = None, [], []
+    intrinsic = IntrinsicReward(hazard=hazard_reward, wrong_subgoal=wrong_subgoal_reward)
     if sub_hindsight:
         relabel = partial(
             relabel_subgoals,
             num_subgoals=num_subgoals,
-            hazard_reward=hazard_reward,
-            wrong_subgoal_reward=wrong_subgoal_reward,
+            rewards=intrinsic,
             hazard_key=has.hazard_key,
         )
         root_extra, next_extra = [keys.SUBGOAL_MASK], [keys.ATTAINED, *has.hazard_keys]
@@ -192,9 +192,7 @@ def make_hdrqn(
                 sub_controller,
                 sub,
                 gamma=gamma,
-                largest_return=largest_intrinsic_return(
-                    hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
-                ),
+                largest_return=intrinsic.largest_return,
                 loss_keys={
                     "reward": keys.INTRINSIC_REWARD,
                     "done": keys.OPTION_DONE,

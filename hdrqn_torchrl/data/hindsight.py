@@ -16,16 +16,14 @@ from torch import Tensor
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data.options import OptionExtractor
-from hdrqn_torchrl.transforms import advance_option, intrinsic_reward
+from hdrqn_torchrl.transforms import IntrinsicReward, advance_option
 
 
 def relabel_subgoals(
     sample: TensorDictBase,
     num_subgoals: int,
     *,
-    reached_reward: float = 1.0,
-    hazard_reward: float = -1.0,
-    wrong_subgoal_reward: float = 0.0,
+    rewards: IntrinsicReward = IntrinsicReward(),  # noqa: B008 (frozen)
     state_keys: Sequence[NestedKey] = (),
     subgoal_key: NestedKey = keys.SUBGOAL,
     attained_key: NestedKey = keys.ATTAINED,
@@ -51,7 +49,7 @@ def relabel_subgoals(
     Args:
         sample: sequences ``[B, T]`` of the sub level with ``attained``, ``hazard`` and ``subgoal_mask``.
         num_subgoals: G.
-        reached_reward, hazard_reward, wrong_subgoal_reward: as in :class:`~hdrqn_torchrl.transforms.SubgoalTransform`.
+        rewards: what the option book paid by.
         state_keys: recurrent states stored with the steps, if any. They come from the subgoal that was pursued; told
             for another one, a sequence starts from zero.
         subgoal_key: subgoal in force, at the root and under ``"next"``.
@@ -78,14 +76,7 @@ def relabel_subgoals(
     cut = after.get(option_done_key) & ~attained.gather(-1, pursued) & left.gather(-1, pursued)
     done = terminated | cut | after.get(keys.DONE)
     init = torch.cat([told.get(option_init_key)[:, :1], done[:, :-1]], 1)
-    reward = intrinsic_reward(
-        attained,
-        reached,
-        None if hazard_key is None else after.get(hazard_key),
-        reached_reward=reached_reward,
-        hazard_reward=hazard_reward,
-        wrong_subgoal_reward=wrong_subgoal_reward,
-    )
+    reward = rewards.of(attained, reached, None if hazard_key is None else after.get(hazard_key))
     for part, key, value in (
         (told, option_init_key, init),
         (after, option_done_key, done),

@@ -49,7 +49,7 @@ from hdrqn_torchrl.objectives.targets import (
     training_mask,
     watkins_trace,
 )
-from hdrqn_torchrl.transforms import largest_intrinsic_return
+from hdrqn_torchrl.transforms import IntrinsicReward
 
 
 class AllSubgoalsLoss(LossModule):
@@ -164,13 +164,11 @@ class AllSubgoalsLoss(LossModule):
         self._modules["target_policy_params"].to_module(target, preserve_module_state=False)
         self.__dict__["_policies"] = (policy, target)
         self.sub_gamma, self.meta_gamma, self.trace_decay = sub_gamma, meta_gamma, trace_decay
-        self.reached_reward, self.wrong_subgoal_reward = reached_reward, wrong_subgoal_reward
-        self.hazard_reward, self.double = hazard_reward, double
+        self.rewards = IntrinsicReward(reached=reached_reward, hazard=hazard_reward, wrong_subgoal=wrong_subgoal_reward)
+        self.double = double
         self.all_subgoals, self.intra_option = all_subgoals, intra_option
         self.max_meta_target, self.min_meta_target = max_meta_target, min_meta_target
-        self.max_sub_target = largest_intrinsic_return(
-            reached_reward=reached_reward, hazard_reward=hazard_reward, wrong_subgoal_reward=wrong_subgoal_reward
-        )
+        self.max_sub_target = self.rewards.largest_return
         self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
         self.lookahead = lookahead
         self.state_keys = list(policy.state_keys) if stored_state else []
@@ -187,7 +185,7 @@ class AllSubgoalsLoss(LossModule):
         read = [policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key, k.action]
         read += self.state_keys
         nexts = [k.attained, k.extrinsic_reward, k.done, k.terminated, k.active_subgoal]
-        nexts += [k.hazard] if self.hazard_reward else []
+        nexts += [k.hazard] if self.rewards.hazard else []
         return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -268,10 +266,7 @@ class AllSubgoalsLoss(LossModule):
         attained = after[k.attained]
         done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
         last = valid[:, :-1] & ~valid[:, 1:]  # before padding
-        other = attained.sum(-1, keepdim=True) > attained.long()  # [B, T, G]
-        reward = self.reached_reward * attained + self.wrong_subgoal_reward * other
-        if self.hazard_reward:
-            reward = reward + self.hazard_reward * after[k.hazard]
+        reward = self.rewards.of_all(attained, after[k.hazard] if self.rewards.hazard else None)
         return {
             "attained": attained,
             "sub_reward": reward,

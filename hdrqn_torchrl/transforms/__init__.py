@@ -1,11 +1,8 @@
-"""TorchRL transforms: the option book, and the window through which an agent sees a screen."""
+"""TorchRL transforms: critics, option books, and the window through which an agent sees a screen."""
 
-from hdrqn_torchrl.transforms.subgoal import (
-    SubgoalTransform,
-    advance_option,
-    intrinsic_reward,
-    largest_intrinsic_return,
-)
+from hdrqn_torchrl.transforms.critic import Critic
+from hdrqn_torchrl.transforms.intrinsic import IntrinsicReward
+from hdrqn_torchrl.transforms.subgoal import SubgoalTransform, advance_option
 from hdrqn_torchrl.transforms.window import Window
 
-__all__ = ["SubgoalTransform", "Window", "advance_option", "intrinsic_reward", "largest_intrinsic_return"]
+__all__ = ["Critic", "IntrinsicReward", "SubgoalTransform", "Window", "advance_option"]

@@ -85,3 +85,13 @@ def describe(spec: TensorSpec) -> str:
 
 def _name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
+
+
+def set_spec(composite: Composite, key: NestedKey, spec: TensorSpec) -> None:
+    """Sets a nested spec, making the composites on its way."""
+    if isinstance(key, tuple) and len(key) > 1:
+        if composite.get(key[0], None) is None:
+            composite[key[0]] = Composite(shape=composite.shape, device=composite.device)
+        set_spec(composite[key[0]], key[1:], spec)
+    else:
+        composite[key[0] if isinstance(key, tuple) else key] = spec

@@ -7,18 +7,16 @@ it like any other entry.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.transforms.entries import Entries
+from hdrqn_torchrl.transforms.critic import Critic, Verdict, set_where_reset
+from hdrqn_torchrl.transforms.entries import Entries, set_spec
+from hdrqn_torchrl.transforms.intrinsic import IntrinsicReward
 
 
 class SubgoalTransform(Transform):
@@ -32,10 +30,15 @@ class SubgoalTransform(Transform):
        ``wrong_subgoal_reward`` if another subgoal was attained;
     4. ``option_return`` :math:`\mathrel{+}= \gamma^{k} r^{ex}`, ``option_steps`` :math:`= k + 1`;
     5. ``option_done`` = reached, or the episode is done, or ``max_option_steps`` are over, or :math:`g` can no
-       longer be chosen; ``option_terminated`` = reached or the episode terminated.
+       longer be chosen, or the option of the level above is done; ``option_terminated`` = reached or the episode
+       terminated.
 
     The policy's ``subgoal`` becomes an additional action. Put every transform that can end an episode
     (``StepCounter(max_steps)``) *before* this one, so that each end of an episode closes its option.
+
+    Several sets of subgoals, from far to near, have one book each, the farther one before the nearer one. The nearer
+    one has a ``prefix`` and sums what the farther one pays: ``SubgoalTransform(5, prefix="rooms",
+    upper_done_key="option_done", extrinsic_reward_key="intrinsic_reward")``.
 
     Args:
         num_subgoals: G.
@@ -48,10 +51,14 @@ class SubgoalTransform(Transform):
             ``subgoal_mask`` excludes what was attained, and an option that pursues it ends after one step.
         available_key: subgoals that are worth choosing now ``[*batch, G]``, written by the environment; it becomes
             ``subgoal_mask``, and ``repeatable`` is not asked. ``None``: the environment says nothing about it.
-        critic: computes ``attained`` ``[*batch, G]`` from the tensordict that follows a step. ``None`` reads
-            ``attained_key``, which the environment then has to write.
-        attained_key, hazard_key, extrinsic_reward_key: entries of the environment; ``hazard_key=None``: no hazard.
+        critic: computes ``attained`` ``[*batch, G]`` from the tensordict that follows a step, and it is written as
+            such (:class:`~hdrqn_torchrl.transforms.Critic`). ``None``: the environment has to write it.
+        prefix: of the names of all entries that concern this set of subgoals (:class:`~hdrqn_torchrl.keys.OptionKeys`),
+            where they are not given below.
+        upper_done_key: ``option_done`` of the level above, written before in the same step; ``None``: there is none.
+        hazard_key, extrinsic_reward_key: entries of the environment; ``hazard_key=None``: no hazard.
         done_key, terminated_key: end of the episode.
+        attained_key: which subgoals a step attained.
         subgoal_key: the policy's proposal.
         option_init_key, active_subgoal_key, subgoal_mask_key, option_steps_key, option_return_key,
             subgoal_reached_key, option_done_key, option_terminated_key, intrinsic_reward_key: entries written.
@@ -79,22 +86,24 @@ class SubgoalTransform(Transform):
         wrong_subgoal_reward: float = 0.0,
         repeatable: bool = False,
         available_key: NestedKey | None = None,
-        critic: Callable[[TensorDictBase], Tensor] | None = None,
-        attained_key: NestedKey = keys.ATTAINED,
+        critic: Verdict | None = None,
+        prefix: str = "",
+        upper_done_key: NestedKey | None = None,
         hazard_key: NestedKey | None = keys.HAZARD,
         extrinsic_reward_key: NestedKey = keys.EXTRINSIC_REWARD,
         done_key: NestedKey = keys.DONE,
         terminated_key: NestedKey = keys.TERMINATED,
-        subgoal_key: NestedKey = keys.SUBGOAL,
-        option_init_key: NestedKey = keys.OPTION_INIT,
-        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
-        subgoal_mask_key: NestedKey = keys.SUBGOAL_MASK,
-        option_steps_key: NestedKey = keys.OPTION_STEPS,
-        option_return_key: NestedKey = keys.OPTION_RETURN,
-        subgoal_reached_key: NestedKey = keys.SUBGOAL_REACHED,
-        option_done_key: NestedKey = keys.OPTION_DONE,
-        option_terminated_key: NestedKey = keys.OPTION_TERMINATED,
-        intrinsic_reward_key: NestedKey = keys.INTRINSIC_REWARD,
+        attained_key: NestedKey | None = None,
+        subgoal_key: NestedKey | None = None,
+        option_init_key: NestedKey | None = None,
+        active_subgoal_key: NestedKey | None = None,
+        subgoal_mask_key: NestedKey | None = None,
+        option_steps_key: NestedKey | None = None,
+        option_return_key: NestedKey | None = None,
+        subgoal_reached_key: NestedKey | None = None,
+        option_done_key: NestedKey | None = None,
+        option_terminated_key: NestedKey | None = None,
+        intrinsic_reward_key: NestedKey | None = None,
     ) -> None:
         if num_subgoals < 1:
             raise ValueError(f"num_subgoals must be >= 1, got {num_subgoals}; give one for each subgoal of the task.")
@@ -102,23 +111,30 @@ class SubgoalTransform(Transform):
             raise ValueError(f"gamma must lie in [0, 1], got {gamma}; use 0.99, or 1.0 for an undiscounted sum.")
         if max_option_steps is not None and max_option_steps < 1:
             raise ValueError(f"max_option_steps must be >= 1 or None, got {max_option_steps}; use None for no limit.")
-        # What is carried from step to step, and what each step reports.
-        self._carried = [option_init_key, active_subgoal_key, subgoal_mask_key, option_steps_key, option_return_key]
-        self._reported = [subgoal_reached_key, option_done_key, option_terminated_key]
-        in_keys = [attained_key] if critic is None else []
-        in_keys += [extrinsic_reward_key, *(key for key in (hazard_key, available_key) if key is not None)]
-        super().__init__(in_keys=in_keys, out_keys=[*self._carried, *self._reported, intrinsic_reward_key])
+        names = keys.OptionKeys(prefix)
+        self.attained_key, self.subgoal_key = attained_key or names.attained, subgoal_key or names.subgoal
+        self.option_init_key = option_init_key or names.option_init
+        self.active_subgoal_key = active_subgoal_key or names.active_subgoal
+        self.subgoal_mask_key = subgoal_mask_key or names.subgoal_mask
+        self.option_steps_key = option_steps_key or names.option_steps
+        self.option_return_key = option_return_key or names.option_return
+        self.subgoal_reached_key = subgoal_reached_key or names.subgoal_reached
+        self.option_done_key = option_done_key or names.option_done
+        self.option_terminated_key = option_terminated_key or names.option_terminated
+        self.intrinsic_reward_key = intrinsic_reward_key or names.intrinsic_reward
+        self.hazard_key = hazard_key if hazard_reward else None
+        self.available_key, self.extrinsic_reward_key = available_key, extrinsic_reward_key
+        self.done_key, self.terminated_key, self.upper_done_key = done_key, terminated_key, upper_done_key
+        self._carried = [self.option_init_key, self.active_subgoal_key, self.subgoal_mask_key]
+        self._carried += [self.option_steps_key, self.option_return_key]
+        self._reported = [self.subgoal_reached_key, self.option_done_key, self.option_terminated_key]
+        read = [self.hazard_key, available_key, upper_done_key, None if critic else self.attained_key]
+        in_keys = [extrinsic_reward_key, *(key for key in read if key is not None)]
+        super().__init__(in_keys=in_keys, out_keys=[*self._carried, *self._reported, self.intrinsic_reward_key])
         self.num_subgoals, self.gamma, self.max_option_steps = num_subgoals, gamma, max_option_steps
-        self.reached_reward, self.hazard_reward = reached_reward, hazard_reward
-        self.wrong_subgoal_reward, self.repeatable, self.critic = wrong_subgoal_reward, repeatable, critic
-        self.available_key = available_key
-        self.attained_key, self.hazard_key, self.extrinsic_reward_key = attained_key, hazard_key, extrinsic_reward_key
-        self.done_key, self.terminated_key, self.subgoal_key = done_key, terminated_key, subgoal_key
-        self.option_init_key, self.active_subgoal_key = option_init_key, active_subgoal_key
-        self.subgoal_mask_key = subgoal_mask_key
-        self.option_steps_key, self.option_return_key = option_steps_key, option_return_key
-        self.subgoal_reached_key, self.option_done_key = subgoal_reached_key, option_done_key
-        self.option_terminated_key, self.intrinsic_reward_key = option_terminated_key, intrinsic_reward_key
+        self.repeatable = repeatable
+        self.critic = None if critic is None else Critic(num_subgoals, critic, attained_key=self.attained_key)
+        self.reward = IntrinsicReward(reached=reached_reward, hazard=hazard_reward, wrong_subgoal=wrong_subgoal_reward)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         init = tensordict.get(self.option_init_key)  # [*batch, 1]
@@ -130,9 +146,14 @@ class SubgoalTransform(Transform):
         book = tensordict.get(self.option_steps_key), tensordict.get(self.option_return_key)
         steps, collected = advance_option(init, *book, next_tensordict.get(self.extrinsic_reward_key), self.gamma)
 
-        attained = next_tensordict.get(self.attained_key) if self.critic is None else self.critic(next_tensordict)
+        if self.critic is not None:
+            next_tensordict = self.critic._step(tensordict, next_tensordict)
+        attained = next_tensordict.get(self.attained_key)
+        hazard = None if self.hazard_key is None else next_tensordict.get(self.hazard_key)
         reached = attained.gather(-1, chosen)
         done = reached | next_tensordict.get(self.done_key)
+        if self.upper_done_key is not None:
+            done = done | next_tensordict.get(self.upper_done_key)
         if self.max_option_steps is not None:
             done = done | (steps >= self.max_option_steps)
         if self.available_key is not None or not self.repeatable:
@@ -148,32 +169,18 @@ class SubgoalTransform(Transform):
             (self.subgoal_reached_key, reached),
             (self.option_done_key, done.clone()),
             (self.option_terminated_key, reached | next_tensordict.get(self.terminated_key)),
-            (self.intrinsic_reward_key, self._intrinsic_reward(attained, reached, next_tensordict)),
+            (self.intrinsic_reward_key, self.reward.of(attained, reached, hazard)),
         ):
             next_tensordict.set(key, value)
         return next_tensordict
 
-    def _intrinsic_reward(self, attained: Tensor, reached: Tensor, next_tensordict: TensorDictBase) -> Tensor:
-        reads_hazard = self.hazard_key is not None and self.hazard_reward
-        return intrinsic_reward(
-            attained,
-            reached,
-            next_tensordict.get(self.hazard_key) if reads_hazard else None,
-            reached_reward=self.reached_reward,
-            hazard_reward=self.hazard_reward,
-            wrong_subgoal_reward=self.wrong_subgoal_reward,
-        )
-
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        reset = tensordict.get("_reset", None)
+        if self.critic is not None:
+            tensordict_reset = self.critic._reset(tensordict, tensordict_reset)
         book = self._fresh_book(tensordict_reset.batch_size, tensordict_reset.device)
         if self.available_key is not None:
             book[self.subgoal_mask_key] = tensordict_reset.get(self.available_key).clone()
-        for key, fresh in book.items():
-            if reset is not None and (kept := tensordict.get(key, None)) is not None:
-                fresh = torch.where(expand_as_right(reset.view(tensordict.batch_size), kept), fresh, kept)
-            tensordict_reset.set(key, fresh)
-        return tensordict_reset
+        return set_where_reset(tensordict, tensordict_reset, book)
 
     def _fresh_book(self, batch_size: torch.Size, device: torch.device | None) -> dict[NestedKey, Tensor]:
         """The option book at the start of an episode: an option is due, every subgoal is left."""
@@ -219,8 +226,9 @@ class SubgoalTransform(Transform):
         entries = Entries(output_spec.shape, *parts)
         if self.critic is None:
             entries.require_flags(self.attained_key, self.num_subgoals)
-        if self.hazard_key is not None and self.hazard_reward:
-            entries.require_flags(self.hazard_key)
+        for key in (self.hazard_key, self.upper_done_key):
+            if key is not None:
+                entries.require_flags(key)
         if self.available_key is not None:
             entries.require_flags(self.available_key, self.num_subgoals)
         entries.require_number(self.extrinsic_reward_key)
@@ -229,13 +237,15 @@ class SubgoalTransform(Transform):
         entries.check("SubgoalTransform")
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        if self.critic is not None:
+            observation_spec = self.critic.transform_observation_spec(observation_spec)
         for key, spec in self._option_specs(observation_spec.shape, observation_spec.device).items():
-            _set_spec(observation_spec, key, spec)
+            set_spec(observation_spec, key, spec)
         return observation_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         intrinsic = Unbounded(shape=(*reward_spec.shape, 1), dtype=torch.float32, device=reward_spec.device)
-        _set_spec(reward_spec, self.intrinsic_reward_key, intrinsic)
+        set_spec(reward_spec, self.intrinsic_reward_key, intrinsic)
         return reward_spec
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -243,8 +253,8 @@ class SubgoalTransform(Transform):
             input_spec["full_state_spec"] = Composite(shape=input_spec.shape, device=input_spec.device)
         specs = self._option_specs(input_spec.shape, input_spec.device)
         for key in self._carried:
-            _set_spec(input_spec["full_state_spec"], key, specs[key])
-        _set_spec(input_spec["full_action_spec"], self.subgoal_key, specs[self.active_subgoal_key].clone())
+            set_spec(input_spec["full_state_spec"], key, specs[key])
+        set_spec(input_spec["full_action_spec"], self.subgoal_key, specs[self.active_subgoal_key].clone())
         return input_spec
 
 
@@ -264,65 +274,3 @@ def advance_option(
     """
     steps = steps.masked_fill(init, 0)
     return steps + 1, collected.masked_fill(init, 0.0) + gamma**steps * reward
-
-
-def intrinsic_reward(
-    attained: Tensor,
-    reached: Tensor,
-    hazard: Tensor | None,
-    *,
-    reached_reward: float = 1.0,
-    hazard_reward: float = -1.0,
-    wrong_subgoal_reward: float = 0.0,
-) -> Tensor:
-    """The critic's reward of a step, for any subgoal: rule 3 of :class:`SubgoalTransform`.
-
-    Args:
-        attained: subgoals that the step attained, ``[*, G]`` bool.
-        reached: whether the one in question is among them, ``[*, 1]`` bool.
-        hazard: whether the step met the hazard, ``[*, 1]`` bool; ``None``: there is none.
-        reached_reward, hazard_reward, wrong_subgoal_reward: as in :class:`SubgoalTransform`.
-
-    Returns:
-        ``[*, 1]``.
-
-    Examples:
-        >>> attained, reached = torch.tensor([[False, True]] * 2), torch.tensor([[True], [False]])
-        >>> intrinsic_reward(attained, reached, None, wrong_subgoal_reward=-0.5)
-        tensor([[ 1.0000],
-                [-0.5000]])
-    """
-    reward = reached_reward * reached.float()
-    if hazard is not None and hazard_reward:
-        reward = reward + hazard_reward * hazard.float()
-    if wrong_subgoal_reward:
-        others = attained.sum(-1, keepdim=True) > reached.long()
-        reward = reward + wrong_subgoal_reward * others.float()
-    return reward
-
-
-def largest_intrinsic_return(
-    *, reached_reward: float = 1.0, hazard_reward: float = -1.0, wrong_subgoal_reward: float = 0.0
-) -> float:
-    """Largest sum of intrinsic rewards that an option can bring: reaching the subgoal pays once, and ends it.
-
-    Where something else pays as well, there is no bound.
-
-    Args:
-        reached_reward, hazard_reward, wrong_subgoal_reward: as in :class:`SubgoalTransform`.
-
-    Examples:
-        >>> largest_intrinsic_return(), largest_intrinsic_return(wrong_subgoal_reward=0.5)
-        (1.0, inf)
-    """
-    return math.inf if max(hazard_reward, wrong_subgoal_reward) > 0.0 else max(reached_reward, 0.0)
-
-
-def _set_spec(composite: Composite, key: NestedKey, spec: TensorSpec) -> None:
-    """Sets a nested spec, making the composites on its way."""
-    if isinstance(key, tuple) and len(key) > 1:
-        if composite.get(key[0], None) is None:
-            composite[key[0]] = Composite(shape=composite.shape, device=composite.device)
-        _set_spec(composite[key[0]], key[1:], spec)
-    else:
-        composite[key[0] if isinstance(key, tuple) else key] = spec

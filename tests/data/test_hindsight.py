@@ -13,7 +13,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import make_hdqn, make_hdrqn
 from hdrqn_torchrl.data import HindsightOptions, OptionExtractor, OptionHistory, StepSelector, relabel_subgoals
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.transforms import SubgoalTransform
+from hdrqn_torchrl.transforms import IntrinsicReward, SubgoalTransform
 
 SUB_ROOT = ["observation", "action", "option_init", "subgoal_mask"]
 SUB_NEXT = ["observation", "intrinsic_reward", "option_done", "option_terminated", "attained", "hazard"]
@@ -133,7 +133,7 @@ class TestRelabelSubgoals:
     def test_told_for_the_other_subgoal(self, played, told):
         sample = sequence(**played)
         before = sample.clone()
-        found = relabel_subgoals(sample, 2, wrong_subgoal_reward=-0.5)
+        found = relabel_subgoals(sample, 2, rewards=IntrinsicReward(wrong_subgoal=-0.5))
         assert found.shape == (2, len(played["pursued"]))
         as_it_was = {"terminated": "", **{key: played[key] for key in shown(found[0]) if key in played}}
         assert shown(found[0]) == as_it_was | {"eligible": "".join(map(str, range(len(played["pursued"]))))}
@@ -161,7 +161,9 @@ class TestRelabelSubgoals:
         played = {"mask": "111 111", "init": "0", "done": "", "reward": [0.0, 0.0]}
         first = sequence(pursued="11", attained="000 001", **played)
         second = sequence(pursued="20", attained="000 100", **(played | {"init": "01", "done": "0"}))
-        found = relabel_subgoals(torch.cat([first, second]), 3, reached_reward=2.0, wrong_subgoal_reward=-0.25)
+        found = relabel_subgoals(
+            torch.cat([first, second]), 3, rewards=IntrinsicReward(reached=2.0, wrong_subgoal=-0.25)
+        )
         assert found.shape == (6, 2)
         assert [shown(row)["pursued"] for row in found] == ["11", "20", "22", "00", "00", "11"]
         assert [shown(row)["reward"][1] for row in found] == [0.0, 0.0, 2.0, 2.0, -0.25, -0.25]
@@ -217,9 +219,9 @@ def test_what_is_told_for_a_subgoal_is_what_acting_for_it_would_have_recorded(go
     actions, proposals = torch.randint(4, (64, 30)), torch.randint(2, (64, 30))
     proposals[:, 0] = 1 - goal
     select = StepSelector(root_keys=SUB_ROOT, next_keys=SUB_NEXT, subgoal_key="subgoal")
-    rewards = {"wrong_subgoal_reward": book.get("wrong_subgoal_reward", 0.0)}
+    rewards = IntrinsicReward(wrong_subgoal=book.get("wrong_subgoal_reward", 0.0))
     played = select(play(actions, proposals, **book))
-    told = relabel_subgoals(played, 2, **rewards)[64:]
+    told = relabel_subgoals(played, 2, rewards=rewards)[64:]
     acted = select(play(actions, torch.full_like(proposals, goal), **book))
     compared = told["eligible"].squeeze(-1)
     assert torch.equal(compared, acted["subgoal_mask"][..., goal]) and (told["subgoal"] == goal).all()

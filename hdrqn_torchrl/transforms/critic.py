@@ -1,0 +1,86 @@
+"""Subgoals of one's own for any environment: a function says which of them a step attained."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import expand_as_right
+from torch import Tensor
+from torchrl.data import Binary, Composite
+from torchrl.envs.transforms import Transform
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.transforms.entries import set_spec
+
+Verdict = Callable[[TensorDictBase], Tensor]
+"""From what follows a step ``[*batch]``, which subgoals the step attained, ``[*batch, G]`` bool."""
+
+
+class Critic(Transform):
+    """Writes ``attained`` as a function has it; what the environment itself wrote there is replaced.
+
+    An environment with it has all that builders ask for, at every level: the option book, losses that teach all
+    subgoals, hindsight and what is counted read the same entry.
+
+    Args:
+        num_subgoals: G.
+        verdict: which subgoals a step attained. A reset attains none.
+        attained_key: the entry written.
+
+    Raises:
+        ValueError: if ``num_subgoals`` is not positive.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> def heights(after):
+        ...     return torch.stack([after["observation"][..., 0].abs() > limit for limit in (0.1, 0.2)], -1)
+        >>> env = TransformedEnv(GymEnv("CartPole-v1"), Critic(2, heights))
+        >>> env.rollout(3)["next", "attained"].shape
+        torch.Size([3, 2])
+    """
+
+    def __init__(self, num_subgoals: int, verdict: Verdict, *, attained_key: NestedKey = keys.ATTAINED) -> None:
+        if num_subgoals < 1:
+            raise ValueError(f"num_subgoals must be >= 1, got {num_subgoals}; give one for each subgoal of the task.")
+        super().__init__(in_keys=[], out_keys=[attained_key])
+        self.num_subgoals, self.verdict, self.attained_key = num_subgoals, verdict, attained_key
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set(self.attained_key, self.verdict(next_tensordict))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        shape = (*tensordict_reset.batch_size, self.num_subgoals)
+        attained = torch.zeros(shape, dtype=torch.bool, device=tensordict_reset.device)
+        return set_where_reset(tensordict, tensordict_reset, {self.attained_key: attained})
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._reset(tensordict, tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        shape = (*observation_spec.shape, self.num_subgoals)
+        set_spec(
+            observation_spec, self.attained_key, Binary(shape=shape, dtype=torch.bool, device=observation_spec.device)
+        )
+        return observation_spec
+
+
+def set_where_reset(
+    tensordict: TensorDictBase, tensordict_reset: TensorDictBase, fresh: dict[NestedKey, Tensor]
+) -> TensorDictBase:
+    """Sets entries ``fresh`` in what a reset returned; environments that go on keep what they had.
+
+    Args:
+        tensordict: what the reset was called with; ``"_reset"`` names the environments concerned, if not all.
+        tensordict_reset: what it returned.
+        fresh: values at the start of an episode.
+    """
+    reset = tensordict.get("_reset", None)
+    for key, value in fresh.items():
+        if reset is not None and (kept := tensordict.get(key, None)) is not None:
+            value = torch.where(expand_as_right(reset.view(tensordict.batch_size), kept), value, kept)
+        tensordict_reset.set(key, value)
+    return tensordict_reset
