@@ -333,10 +333,10 @@ class TestWhatLivesOnTheHost:
         algorithm, env = make("v2")
         batches = collect(algorithm, env, 6, batches=2)
         legs, other = LegCounter(2), LegCounter(2)
-        legs.add(batches[0])
+        legs.observe(batches[0])
         other.load_state_dict(elsewhere(legs.state_dict()))
         for each in (legs, other):
-            each.add(batches[1])
+            each.observe(batches[1])
         assert torch.equal(other.options, legs.options) and legs.options.sum() > 20
 
     def test_priorities(self):

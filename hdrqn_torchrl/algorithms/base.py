@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learning import Learner, LearnerSettings, Phases
+from hdrqn_torchrl.learning import Learner, LearnerSettings, Monitor
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
 
@@ -31,7 +31,7 @@ class Algorithm:
     learners: dict[str, Learner]
     explorations: dict[str, EpsilonGreedy]
     make_transforms: Callable[[], Compose]
-    phases: Phases | None = None
+    monitors: dict[str, Monitor] = field(default_factory=dict)
     task: Task = field(default_factory=Task)
 
     def transform(self, env: EnvBase) -> TransformedEnv:
@@ -39,7 +39,7 @@ class Algorithm:
         return TransformedEnv(env, self.make_transforms(), auto_unwrap=True)
 
     def observe(self, batch: TensorDictBase) -> None:
-        """Takes in a collected batch ``[N, T]``: every learner stores it, schedules and phases go on.
+        """Takes in a collected batch ``[N, T]``: every learner stores it, schedules go on, monitors watch.
 
         Updates are then due (:meth:`Learner.updates_due`).
         """
@@ -48,8 +48,8 @@ class Algorithm:
         for exploration in self.explorations.values():
             exploration.step(batch.numel())
             exploration.observe(batch)
-        if self.phases is not None:
-            self.phases.observe(batch)
+        for monitor in self.monitors.values():
+            monitor.observe(batch)
 
 
 def copies_of(*transforms: Transform) -> Callable[[], Compose]:

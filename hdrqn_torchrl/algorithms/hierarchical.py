@@ -24,7 +24,7 @@ from hdrqn_torchrl.data import (
     relabel_subgoals,
 )
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learning import Extract, Learner, LearnerSettings, PhaseOne, Phases
+from hdrqn_torchrl.learning import Extract, Learner, LearnerSettings, PhaseOne, phase_monitors
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.transforms import IntrinsicReward, SubgoalTransform
 
@@ -252,7 +252,7 @@ def make_hdrqn(
         explorations={"sub": sub_exploration, "meta": meta_exploration},
         task=has.task,
         make_transforms=copies_of(InitTracker(), subgoals, *primers),
-        phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, meta_learner),
+        monitors=phase_monitors(phase_one, num_subgoals, meta_exploration, meta_learner),
     )
 
 

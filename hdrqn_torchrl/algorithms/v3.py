@@ -14,7 +14,7 @@ from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, largest_target, 
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learning import Learner, LearnerSettings, PhaseOne, Phases
+from hdrqn_torchrl.learning import Learner, LearnerSettings, PhaseOne, phase_monitors
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
     AllSubgoalsPolicy,
@@ -206,7 +206,7 @@ def make_v3(
         explorations={"sub": sub_exploration, "meta": meta_exploration},
         task=has.task,
         make_transforms=copies_of(InitTracker(), subgoals, policy.make_tensordict_primer()),
-        phases=None if phase_one is None else Phases(phase_one, num_subgoals, meta_exploration, None),
+        monitors=phase_monitors(phase_one, num_subgoals, meta_exploration, None),
     )
 
 

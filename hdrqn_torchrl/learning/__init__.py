@@ -1,7 +1,17 @@
 """Learning: one learner for each level, its settings, and what watches over it."""
 
 from hdrqn_torchrl.learning.learner import Extract, Learner
-from hdrqn_torchrl.learning.phases import PhaseOne, Phases
+from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
+from hdrqn_torchrl.learning.phases import PhaseOne, Phases, phase_monitors
 from hdrqn_torchrl.learning.settings import LearnerSettings
 
-__all__ = ["Extract", "Learner", "LearnerSettings", "PhaseOne", "Phases"]
+__all__ = [
+    "Extract",
+    "Learner",
+    "LearnerSettings",
+    "Monitor",
+    "PhaseOne",
+    "Phases",
+    "VisitCounter",
+    "phase_monitors",
+]

@@ -19,7 +19,7 @@ _READ = (
 
 
 class LegCounter:
-    """Counts options by the subgoal that was attained last when they began, and by the one they pursued.
+    """A monitor: counts options by the subgoal that was attained last when they began, and by the one they pursued.
 
     Row G stands for the start of an episode. Where an episode begins at a subgoal (practice), ``attained`` of its
     reset says so.
@@ -36,7 +36,7 @@ class LegCounter:
         ...          "option_done": yes, "subgoal_reached": yes}
         >>> root = {"is_init": yes, "option_init": yes, "attained": torch.tensor([[[False, False]]]), "next": after}
         >>> legs = LegCounter(2)
-        >>> legs.add(TensorDict(root, [1, 1]))
+        >>> legs.observe(TensorDict(root, [1, 1]))
         >>> legs.options.tolist(), legs.reached.tolist()
         ([[0, 0], [0, 0], [0, 1]], [[0, 0], [0, 0], [0, 1]])
     """
@@ -50,7 +50,7 @@ class LegCounter:
         self._place: Tensor | None = None  # [N]: attained last
         self._origin: Tensor | None = None  # [N]: attained last when the option began
 
-    def add(self, batch: TensorDictBase) -> None:
+    def observe(self, batch: TensorDictBase) -> None:
         """Takes a collected batch ``[N, T]``."""
         for step in batch.select(*_READ).cpu().unbind(1):
             self.add_step(step)
@@ -80,6 +80,15 @@ class LegCounter:
     def rates(self) -> Tensor:
         """``[G + 1, G]``: share of the options that reached their subgoal; NaN where there was none."""
         return self.reached / self.options
+
+    def metrics(self) -> dict[str, float]:
+        """:attr:`rates` by name, such as ``legs/start_to_0``."""
+        names = [*range(self.num_subgoals), "start"]
+        return {
+            f"legs/{origin}_to_{target}": rate
+            for origin, row in zip(names, self.rates.tolist(), strict=True)
+            for target, rate in enumerate(row)
+        }
 
     def clear(self) -> None:
         """Counts from zero again; episodes and options in progress go on."""

@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 
 from hdrqn_torchrl.learning.learner import Learner
 from hdrqn_torchrl.learning.legs import LegCounter
+from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
 from hdrqn_torchrl.modules import EpsilonGreedy, SubgoalSuccess
 
 
@@ -18,9 +19,9 @@ class PhaseOne:
     """How long the sub level learns alone.
 
     Args:
-        success: it ends when every subgoal is reached by this share of the last options for it ...
-        min_options: ... of which there have been so many, ...
-        max_frames: ... or after so many environment frames.
+        success: it ends when this share of the last options for every subgoal reached it ...
+        min_options: ... and that many options for each have ended, ...
+        max_frames: ... or after that many environment frames.
         window: number of options that success is measured over.
 
     Raises:
@@ -40,7 +41,7 @@ class PhaseOne:
 
 
 class Phases:
-    """Holds the meta level while the first phase lasts: it chooses subgoals at random and does not learn.
+    """Holds the meta level while the first phase lasts: it chooses subgoals at random and does not learn. (A monitor.)
 
     Args:
         settings: how long that is.
@@ -59,7 +60,6 @@ class Phases:
             raise ValueError(f"meta_exploration.start must be 1.0 with phase_one, got {exploration.start}.")
         self.settings, self.exploration, self.learner = settings, exploration, learner
         self.success = SubgoalSuccess(num_subgoals, window=settings.window).to(exploration.epsilon.device)
-        self.legs = LegCounter(num_subgoals)
         self.frames = 0
         self._hold(True)
 
@@ -71,7 +71,6 @@ class Phases:
     def observe(self, batch: TensorDictBase) -> None:
         """Takes note of a collected batch ``[N, T]``, and begins the second phase when it is time."""
         self.success.observe(batch)
-        self.legs.add(batch)
         self.frames += batch.numel()
         if self.phase == 1:
             tried = (self.success.options >= self.settings.min_options).all()
@@ -80,17 +79,12 @@ class Phases:
                 self._hold(False)
 
     def metrics(self) -> dict[str, float]:
-        """Phase, success of each subgoal's last options, and of each leg since :meth:`clear` (NaN where none ended)."""
+        """Phase, and success of each subgoal's last options (NaN where none ended)."""
         known = self.success.rates.masked_fill(self.success.options == 0, torch.nan)
-        rates = {f"phase/success_{index}": rate for index, rate in enumerate(known.tolist())}
-        for origin, row in enumerate(self.legs.rates.tolist()):
-            name = "start" if origin == self.legs.num_subgoals else origin
-            rates |= {f"legs/{name}_to_{target}": rate for target, rate in enumerate(row)}
-        return {"phase": self.phase, **rates}
+        return {"phase": self.phase, **{f"phase/success_{index}": rate for index, rate in enumerate(known.tolist())}}
 
     def clear(self) -> None:
-        """Begins the next row's count of legs. Call it when the last one is written, no sooner."""
-        self.legs.clear()
+        """Nothing begins anew with a row."""
 
     def _hold(self, held: bool) -> None:
         self.exploration.held = held
@@ -101,7 +95,6 @@ class Phases:
         """What it has counted, and which phase it is."""
         return {
             "success": dict(self.success.state_dict()),
-            "legs": self.legs.state_dict(),
             "frames": self.frames,
             "held": self.phase == 1,
         }
@@ -109,6 +102,23 @@ class Phases:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self.success.load_state_dict(state["success"])
-        self.legs.load_state_dict(state["legs"])
         self.frames = state["frames"]
         self._hold(state["held"])
+
+
+def phase_monitors(
+    settings: PhaseOne | None, num_subgoals: int, exploration: EpsilonGreedy, learner: Learner | None
+) -> dict[str, Monitor]:
+    """What a training in two phases is watched by; nothing if ``settings`` is ``None``.
+
+    Args:
+        settings, num_subgoals, exploration, learner: as in :class:`Phases`.
+
+    Examples:
+        >>> list(phase_monitors(PhaseOne(), 2, EpsilonGreedy(), None))
+        ['phases', 'legs', 'visits']
+    """
+    if settings is None:
+        return {}
+    phases = Phases(settings, num_subgoals, exploration, learner)
+    return {"phases": phases, "legs": LegCounter(num_subgoals), "visits": VisitCounter()}

@@ -10,17 +10,17 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tensordict import TensorDictBase
+from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.learning import Learner
 from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch
-from hdrqn_torchrl.runs.checkpoint import MEMORY, Checkpoints, RandomState
+from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
+from hdrqn_torchrl.runs.components import components_of, explained
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
@@ -70,7 +70,7 @@ class Trainer:
         self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
-        self._tracker = EpisodeTracker(algorithm.task, per_subgoal=algorithm.phases is not None)
+        self._tracker = EpisodeTracker(algorithm.task)
         self._window = Window()
         self._stop = StopRequest()
         self._started = self._saved_at = time.monotonic()
@@ -165,8 +165,9 @@ class Trainer:
             **{f"{name}/updates": learner.updates for name, learner in self.algorithm.learners.items()},
             **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
             **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
-            **({} if self.algorithm.phases is None else self.algorithm.phases.metrics()),
         }
+        for monitor in self.algorithm.monitors.values():
+            row |= monitor.metrics()
         best = False
         if evaluation:
             with self._stop.at_once():
@@ -185,8 +186,8 @@ class Trainer:
     def _begin_row(self) -> None:
         """Starts counting anew; only now that a row is on the disk: a stop before would lose what was counted."""
         self._window = Window(self.frames)
-        if self.algorithm.phases is not None:
-            self.algorithm.phases.clear()
+        for monitor in self.algorithm.monitors.values():
+            monitor.clear()
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint of the whole training, unless nothing happened since the last one.
@@ -202,12 +203,16 @@ class Trainer:
         """Restores everything from a checkpoint; :meth:`train` then goes on from there, and later ones are removed.
 
         Raises:
-            CheckpointError: if the checkpoint is damaged or of another kind of training.
+            CheckpointError: if the checkpoint is damaged, of another kind of training, or of phases as earlier versions
+                stored them.
         """
         assert self.checkpoints is not None
         device = next(self.algorithm.policy.parameters()).device
         rules = rules_of(self.collector.env) if hasattr(self.collector, "env") else {}  # others are made elsewhere
-        missing = self.checkpoints.load(self._components(), path, device=device, rules=rules)
+        try:
+            missing = self.checkpoints.load(self._components(), path, device=device, rules=rules)
+        except CheckpointError as error:
+            raise explained(error, path) from error
         self.checkpoints.go_back_to(self.frames)
         self.collector.update_policy_weights_()
         self._saved_at, self._saved_position = time.monotonic(), self._position
@@ -225,11 +230,8 @@ class Trainer:
         """All that a training consists of. They are restored in the order of their names."""
         return {
             "collector": self.collector,
-            **{f"learner-{name}": _but_memory(learner) for name, learner in self.algorithm.learners.items()},
-            **{f"{MEMORY}{name}": _memory(learner) for name, learner in self.algorithm.learners.items()},
+            **components_of(self.algorithm),
             "logger": self.logger,
-            **({} if self.algorithm.phases is None else {"phases": self.algorithm.phases}),
-            "policy": self.algorithm.policy,
             "random": RandomState(),
             "trainer": self,
         }
@@ -258,21 +260,6 @@ class Trainer:
         self._started = time.monotonic() - state["wall_seconds"]
         self._tracker.load_state_dict(state["tracker"])
         self._window.load_state_dict(state["window"])
-
-
-class _Part:
-    """A component by its two methods."""
-
-    def __init__(self, save: Callable[[], dict[str, Any]], load: Callable[[dict[str, Any]], None]) -> None:
-        self.state_dict, self.load_state_dict = save, load
-
-
-def _but_memory(learner: Learner) -> _Part:
-    return _Part(partial(learner.state_dict, memory=False), learner.load_state_dict)
-
-
-def _memory(learner: Learner) -> _Part:
-    return _Part(learner.memory_state_dict, learner.load_memory_state_dict)
 
 
 def crossed(before: int, after: int, interval: int) -> bool:

@@ -52,9 +52,7 @@ class Window:
         row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
         if self._episodes:
             episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
-            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items() if value.ndim == 1}
-            if "attained" in episodes:
-                row |= _visits(episodes["attained"])
+            row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items()}
         for learner, sums in self._sums.items():
             count = self._counts[learner]
             row |= {f"{learner}/{name}": (total / count).item() for name, total in sums.items()}
@@ -75,13 +73,6 @@ class Window:
         """Restores what :meth:`state_dict` returned."""
         self._frames, self._since = state["frames"], time.monotonic() - state["seconds"]
         self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]
-
-
-def _visits(attained: Tensor) -> Row:
-    """Share of episodes ``[M, G]`` that attained each subgoal, and how often they did."""
-    shares, visits = (attained > 0).float().mean(0).tolist(), attained.mean(0).tolist()
-    row: Row = {f"behaviour/attained_{index}": share for index, share in enumerate(shares)}
-    return row | {f"behaviour/visits_{index}": number for index, number in enumerate(visits)}
 
 
 def check_counters(state: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 import math
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -36,7 +37,7 @@ EPISODE = [
 
 def test_options_by_origin_and_target():
     legs = LegCounter(2)
-    legs.add(batch(*EPISODE))
+    legs.observe(batch(*EPISODE))
     assert legs.options.tolist() == [[0, 2], [1, 0], [1, 0]]
     assert legs.reached.tolist() == [[0, 1], [0, 0], [1, 0]]
     assert legs.rates[0, 1] == 0.5 and math.isnan(legs.rates[1, 1])
@@ -44,24 +45,34 @@ def test_options_by_origin_and_target():
 
 def test_a_new_episode_begins_at_the_start_or_where_it_says():
     legs = LegCounter(2)
-    legs.add(batch(*EPISODE))
+    legs.observe(batch(*EPISODE))
     legs.clear()
-    legs.add(batch((True, None, True, 1, 1, True), (True, 0, True, 1, None, True)))
+    legs.observe(batch((True, None, True, 1, 1, True), (True, 0, True, 1, None, True)))
     assert legs.options.tolist() == [[0, 1], [0, 0], [0, 1]]
 
 
 def test_an_option_begins_where_it_began_whatever_it_passes():
     legs = LegCounter(2)
-    legs.add(batch((True, None, True, 1, 0, False), (False, None, False, 1, 1, True)))
+    legs.observe(batch((True, None, True, 1, 0, False), (False, None, False, 1, 1, True)))
     assert legs.reached.tolist() == [[0, 0], [0, 0], [0, 1]]
 
 
 def test_batches_may_be_cut_anywhere_and_its_state_goes_on():
     whole, cut = LegCounter(2), LegCounter(2)
-    whole.add(batch(*EPISODE))
+    whole.observe(batch(*EPISODE))
     for step in EPISODE:
-        cut.add(batch(step))
+        cut.observe(batch(step))
         restored = LegCounter(2)
         restored.load_state_dict(cut.state_dict())
         cut = restored
     assert (cut.options == whole.options).all() and (cut.reached == whole.reached).all()
+
+
+def test_its_columns_are_shares_by_name_and_a_new_row_counts_anew():
+    legs = LegCounter(2)
+    legs.observe(batch(*EPISODE))
+    metrics = legs.metrics()
+    assert list(metrics) == [f"legs/{origin}_to_{target}" for origin in (0, 1, "start") for target in (0, 1)]
+    assert list(metrics.values()) == pytest.approx(legs.rates.flatten().tolist(), nan_ok=True)
+    legs.clear()
+    assert all(math.isnan(share) for share in legs.metrics().values())

@@ -28,18 +28,6 @@ def test_without_episodes_there_is_no_column_of_them():
     assert set(window.summary(10)) == {"frames_per_second"}
 
 
-def test_visits_count_how_often_and_attained_counts_episodes():
-    window = Window()
-    window.add_episodes(episodes([0.0, 0.0], [[2.0, 0.0], [0.0, 0.0]]))
-    row = window.summary(10)
-    assert [row[f"behaviour/{name}"] for name in ("attained_0", "visits_0", "attained_1", "visits_1")] == [
-        0.5,
-        1.0,
-        0.0,
-        0.0,
-    ]
-
-
 def test_a_restored_window_goes_on_where_the_other_was():
     window, other = Window(frames=50), Window()
     window.add_episodes(episodes([1.0]))

@@ -66,7 +66,7 @@ def test_agents_learn_on_an_environment_whose_subgoals_come_from_a_critic_only(n
     agent, legs = build(name, env, **settings), LegCounter(2)
     for batch in collect(agent, env, 12, batches=4):
         agent.observe(batch)
-        legs.add(batch)
+        legs.observe(batch)
         for learner in agent.learners.values():
             for _ in range(learner.updates_due()):
                 assert torch.isfinite(learner.update(learner.sample())["loss"])
