@@ -96,6 +96,10 @@ class OptionKeys:
         return self.of(SUBGOAL_EXPLORATION)
 
     @property
+    def exploration(self) -> str:
+        return self.of(SUBGOAL_EXPLORATION)
+
+    @property
     def option_init(self) -> str:
         return self.of(OPTION_INIT)
 

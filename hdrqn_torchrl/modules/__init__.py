@@ -1,6 +1,7 @@
 """Networks, controllers and exploration as (TensorDict) modules."""
 
-from hdrqn_torchrl.modules.all_subgoals import AllSubgoalsNetwork, AllSubgoalsPolicy
+from hdrqn_torchrl.modules.all_subgoals import AllSubgoalsPolicy
+from hdrqn_torchrl.modules.all_subgoals_network import AllSubgoalsNetwork
 from hdrqn_torchrl.modules.architectures import Architecture, compact_network, observation_predictor, paper_network
 from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy

@@ -1,21 +1,25 @@
-r"""hDRQNv3's loss: every subgoal and both levels learn from every step.
+r"""hDRQNv3's loss: every subgoal and every level learn from every step.
 
-Sub level, for each subgoal g, whichever was pursued:
+Level l chooses among :math:`X_l` (actions at level 0, else subgoals) and pursues some c of :math:`C_l = X_{l+1}`; the
+top level pursues the task. For every level, every c and every x that would have led to what was done in step t:
 
-.. math:: r^g_t = 1[g\ attained] + r_{wrong} 1[another\ attained] + r_{hazard} 1[hazard],
-          \quad y^g_t = r^g_t + \gamma_S (1 - e^g_t) ((1 - \lambda_t) V^g(s_{t+1}) + \lambda_t y^g_{t+1})
+.. math:: y_l(c, x) = r_l(c) + \gamma_l (1 - e_l(c)) ((1 - \lambda_t) U_l(c, x) + \lambda_t y_l(c, x)_{t+1})
 
-where :math:`e^g_t` is the end of the episode or of the subgoal, and :math:`\lambda_t` is lambda where the next action
-is greedy for g, else 0 (Watkins' cut). Meta level, by intra-option learning (Sutton, Precup and Singh, 1998): a step
-belongs to every option that would have taken its action, and to the one pursued,
+- reward :math:`r_l(c)`: the task's extrinsic reward at the top; below, what the critic pays for c
+  (:class:`~hdrqn_torchrl.transforms.SubgoalTransform`, rule 3);
+- end :math:`e_l(c)`: the episode terminated, or c was attained (below the top);
+- :math:`U = \max_{x'} Q_l(s', c, x')` (Double, among what can be chosen) where x was attained in this step, as an
+  action is by every step; else :math:`Q_l(s', c, x)`: the option goes on;
+- :math:`\lambda_t` is lambda where the next step agrees with x, else 0 (Watkins' cut); a subgoal's trace ends where it
+  is attained;
+- a subgoal x agrees with a step if the greedy choice of the level below for x does, recursively, down to the action
+  taken. x learns from steps it agrees with (intra-option learning; Sutton, Precup and Singh, 1998), and from those at
+  which it was pursued.
 
-.. math:: y_t(g) = r^{ex}_t + \gamma_M U_{t+1}(g)
+So every level learns from every step, and not only from those at which its options begin. Without intra-option
+learning a level above the first learns where options begin only, from what the option brought (SMDP),
 
-with :math:`U(g) = \max_{g'} Q^M(s', g')` where g was attained, else :math:`(1 - \lambda_t) Q^M(s', g) + \lambda_t
-y_{t+1}(g)`. So the meta level, too, learns from every step and not only from those at which options begin. Without
-intra-option learning it learns where options begin only, from what the option brought (SMDP),
-
-.. math:: y = r^{ex}_0 + \gamma_M r^{ex}_1 + \dots + \gamma_M^k ((1 - \lambda') \max_{g'} Q^M(s_k, g') + \lambda' y_k)
+.. math:: y = r_0 + \gamma r_1 + \dots + \gamma^k ((1 - \lambda') \max_{x'} Q(s_k, x') + \lambda' y_k)
 
 with :math:`\lambda'` = lambda where the next subgoal is the greedy one, else 0.
 
@@ -25,7 +29,7 @@ Memory: if the network has a predictor, it is also trained to tell what the next
 from __future__ import annotations
 
 import math
-from copy import deepcopy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -34,47 +38,43 @@ from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
-from torchrl.objectives import LossModule
-from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
-from hdrqn_torchrl.modules.exploration import mask_values
-from hdrqn_torchrl.objectives.prediction import prediction_loss
-from hdrqn_torchrl.objectives.targets import (
-    double_q_value,
-    importance_weight,
-    lambda_returns,
-    sequence_priority,
-    training_mask,
-    watkins_trace,
-)
-from hdrqn_torchrl.transforms import IntrinsicReward
+from hdrqn_torchrl.objectives.base import SequenceLoss, masked_mean
+from hdrqn_torchrl.objectives.level_targets import Columns, LevelTargets, StepEvents, make_rules
+from hdrqn_torchrl.objectives.targets import lambda_returns, sequence_priority
+
+Values = tuple[Tensor, ...]
 
 
-class AllSubgoalsLoss(LossModule):
+class AllSubgoalsLoss(SequenceLoss):
     """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + lookahead]`` of steps.
 
     The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
     on through ends of episodes; each should begin where an episode does, because the memory starts empty, unless it
-    starts from what was stored (``stored_state``). Steps
-    after a sequence's end are padding (``mask``): they contribute nothing, and what the last real step led to is
-    unknown unless it ended the episode. ``priority`` tells what is left to learn from each sequence, of both levels
-    together, ``[B]``.
+    starts from what was stored (``stored_state``). Steps after a sequence's end are padding (``mask``): they contribute
+    nothing, and what the last real step led to is unknown unless it ended the episode. ``priority`` tells what is left
+    to learn from each sequence, of all levels together, ``[B]``.
 
     Args:
         policy: network and keys.
-        sub_gamma: discount of the sub level. A low one makes haste pay: of two ways, the shorter stands out.
-        meta_gamma: discount of the meta level, per environment step.
+        sub_gamma: discount of level 0. A low one makes haste pay: of two ways, the shorter stands out.
+        meta_gamma: discount of the top level, per environment step.
+        middle_gamma: of the levels between; ``None``: ``meta_gamma``.
         trace_decay: lambda.
-        reached_reward, wrong_subgoal_reward, hazard_reward: of the sub level, for attaining the subgoal, attaining
-            another one, meeting the hazard (which is not read if that is 0).
+        reached_reward, hazard_reward: of the levels below the top, for attaining the subgoal, and for meeting the
+            hazard (which is not read if that is 0).
+        wrong_subgoal_reward: for attaining another subgoal of the same set; one number, or one for each set from near
+            to far.
+        bonus_reward: for an agent of one level, which has no critic: added to the task's reward for each subgoal that a
+            step attains (key ``bonus``).
         double: Double Q-learning.
-        all_subgoals: ``False``: only the subgoal that was pursued learns, at both levels.
-        intra_option: ``False``: the meta level learns from the steps at which options begin only, and of those whose
-            end is in the sequence. (``True`` takes options to last until their subgoal is attained: a step limit of
-            options is not seen.)
-        max_meta_target, min_meta_target: largest and smallest return of the task there can be, if known; the meta
+        all_subgoals: ``False``: each level learns only about what was pursued.
+        intra_option: ``False``: levels that choose subgoals learn from the steps at which options begin only, and of
+            those whose end is in the sequence. (``True`` takes options to last until their subgoal is attained: a step
+            limit of options is not seen.)
+        max_meta_target, min_meta_target: largest and smallest return of the task there can be, if known; the top
             level's targets are kept between them.
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
             in sequences that begin where an episode does, every state is exact.
@@ -96,13 +96,11 @@ class AllSubgoalsLoss(LossModule):
     @dataclass
     class _AcceptedKeys:
         action: NestedKey = keys.ACTION
-        attained: NestedKey = keys.ATTAINED
         hazard: NestedKey = keys.HAZARD
         extrinsic_reward: NestedKey = keys.EXTRINSIC_REWARD
+        bonus: NestedKey = keys.ATTAINED
         done: NestedKey = keys.DONE
         terminated: NestedKey = keys.TERMINATED
-        active_subgoal: NestedKey = keys.ACTIVE_SUBGOAL
-        option_init: NestedKey = keys.OPTION_INIT
         mask: NestedKey = keys.PAD_MASK
         priority_weight: NestedKey = "priority_weight"
 
@@ -111,18 +109,7 @@ class AllSubgoalsLoss(LossModule):
     policy: AllSubgoalsPolicy
     policy_params: TensorDictParams
     target_policy_params: TensorDictParams
-    out_keys = [
-        "loss",
-        "sub_loss",
-        "meta_loss",
-        "td_error",
-        "meta_td_error",
-        "q_value",
-        "target",
-        "meta_q_value",
-        "trained_steps",
-        "priority",
-    ]
+    out_keys = ["loss", "sub_loss", "td_error", "q_value", "target", "trained_steps", "priority"]
 
     def __init__(
         self,
@@ -130,10 +117,12 @@ class AllSubgoalsLoss(LossModule):
         *,
         sub_gamma: float = 0.95,
         meta_gamma: float = 0.97,
+        middle_gamma: float | None = None,
         trace_decay: float = 0.8,
         reached_reward: float = 1.0,
-        wrong_subgoal_reward: float = 0.0,
+        wrong_subgoal_reward: float | Sequence[float] = 0.0,
         hazard_reward: float = -1.0,
+        bonus_reward: float = 0.0,
         double: bool = True,
         all_subgoals: bool = True,
         intra_option: bool = True,
@@ -146,216 +135,145 @@ class AllSubgoalsLoss(LossModule):
         stored_state: bool = False,
         prediction_weight: float = 0.1,
     ) -> None:
-        if prediction_weight < 0.0:
-            raise ValueError(f"prediction_weight must be >= 0, got {prediction_weight}; use 0.1, or no predictor.")
-        for name, value in (("sub_gamma", sub_gamma), ("meta_gamma", meta_gamma), ("trace_decay", trace_decay)):
+        middle_gamma = meta_gamma if middle_gamma is None else middle_gamma
+        rates = {"sub_gamma": sub_gamma, "meta_gamma": meta_gamma, "middle_gamma": middle_gamma}
+        for name, value in {**rates, "trace_decay": trace_decay}.items():
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
-        if not 0.0 <= burn_in < 1.0:
-            raise ValueError(f"burn_in must lie in [0, 1), got {burn_in}; use 0 for sequences from an episode's start.")
-        if loss_function not in ("l2", "smooth_l1"):
-            raise ValueError(f"loss_function must be 'l2' or 'smooth_l1', got {loss_function!r}; the default is 'l2'.")
         if lookahead < 1:
             raise ValueError(f"lookahead must be >= 1 step, got {lookahead}; the last one is never trained.")
-        super().__init__()
-        self.convert_to_functional(policy, "policy", create_target_params=True)
-        # As in RecurrentDQNLoss: the modules as they are called, outside the module tree.
-        target = deepcopy(policy)
-        self._modules["target_policy_params"].to_module(target, preserve_module_state=False)
-        self.__dict__["_policies"] = (policy, target)
-        self.sub_gamma, self.meta_gamma, self.trace_decay = sub_gamma, meta_gamma, trace_decay
-        self.rewards = IntrinsicReward(reached=reached_reward, hazard=hazard_reward, wrong_subgoal=wrong_subgoal_reward)
-        self.double = double
-        self.all_subgoals, self.intra_option = all_subgoals, intra_option
-        self.max_meta_target, self.min_meta_target = max_meta_target, min_meta_target
-        self.max_sub_target = self.rewards.largest_return
-        self.burn_in, self.train_exact_states, self.loss_function = burn_in, train_exact_states, loss_function
-        self.lookahead = lookahead
+        super().__init__(
+            policy,
+            "policy",
+            burn_in=burn_in,
+            train_exact_states=train_exact_states,
+            lookahead=lookahead,
+            double=double,
+            loss_function=loss_function,
+            predictor=policy.network.predictor,
+            prediction_weight=prediction_weight,
+        )
+        self.rules = make_rules(
+            policy.subgoal_keys,
+            **rates,
+            reached_reward=reached_reward,
+            wrong_subgoal_reward=wrong_subgoal_reward,
+            hazard_reward=hazard_reward,
+            largest_return=max_meta_target,
+            smallest_return=min_meta_target,
+        )
+        self.targets = LevelTargets(
+            rules=self.rules,
+            trace_decay=trace_decay,
+            double=double,
+            all_subgoals=all_subgoals,
+            intra_option=intra_option,
+        )
+        self.bonus_reward, self.reads_hazard = bonus_reward, bool(hazard_reward and policy.subgoal_keys)
         self.state_keys = list(policy.state_keys) if stored_state else []
-        self.prediction_weight = prediction_weight
-        if self._predicts:
-            self.out_keys = [*self.out_keys, "prediction_loss"]
-
-    def _forward_value_estimator_keys(self, **kwargs) -> None:
-        """The keys are read at every call; nothing to pass on."""
+        for rule in self.rules[1:]:
+            self.out_keys = [*self.out_keys, *(f"{rule.name}_{figure}" for figure in ("loss", "td_error", "q_value"))]
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        policy, k = self._policies[0], self.tensor_keys
-        read = [policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key, k.action]
-        read += self.state_keys
-        nexts = [k.attained, k.extrinsic_reward, k.done, k.terminated, k.active_subgoal]
-        nexts += [k.hazard] if self.rewards.hazard else []
-        return [*read, k.option_init, *(unravel_key(("next", key)) for key in nexts)]
+        policy, k = self._networks[0], self.tensor_keys
+        read = [policy.observation_key, policy.previous_action_key, policy.init_key, *policy.mask_keys, k.action]
+        read += [*self.state_keys, *(each.option_init for each in policy.subgoal_keys)]
+        nexts = [k.extrinsic_reward, k.done, k.terminated]
+        nexts += [key for each in policy.subgoal_keys for key in (each.attained, each.active_subgoal)]
+        nexts += [k.hazard] if self.reads_hazard else []
+        nexts += [k.bonus] if self.bonus_reward else []
+        return [*read, *(unravel_key(("next", key)) for key in nexts)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         online, target, memory = self._values(tensordict)
-        steps, valid = tensordict[:, :-1], self._valid(tensordict)
-        events = self._events(steps, valid)
+        valid, action = self._valid(tensordict), tensordict[self.tensor_keys.action]
         with torch.no_grad():
-            sub_target, meta_target, agrees = self._targets(online, target, tensordict, events)
-        action = steps[self.tensor_keys.action][..., None, None].expand(*events["attained"].shape, 1)
-        sub_value = online[0][:, :-1].gather(-1, action).squeeze(-1)  # [B, T, G]
-        meta_value = online[1][:, :-1]
-        sub_steps, meta_steps = self._trained(tensordict, valid[:, :-1], events, agrees)
+            columns = self.targets.columns(online, target, action, tensordict, self._events(tensordict, valid))
+            wanted = self._wanted(columns)
+            init = tensordict[self._networks[0].init_key].squeeze(-1)
+            warm = self._warm(valid[:, :-1], init[:, :-1], self.lookahead - 1).unsqueeze(-1)
+            trained = [each.trained & warm for each in columns]
+        values = _chosen(online, action)
         weight = tensordict.get(self.tensor_keys.priority_weight, None)
-        sub_loss = self._distance(sub_value, sub_target, sub_steps, weight)
-        meta_loss = self._distance(meta_value, meta_target, meta_steps, weight)
-        with torch.no_grad():
-            report = {
-                "td_error": _masked_mean((sub_value - sub_target).abs(), sub_steps),
-                "meta_td_error": _masked_mean((meta_value - meta_target).abs(), meta_steps),
-                "q_value": _masked_mean(sub_value, sub_steps),
-                "target": _masked_mean(sub_target, sub_steps),
-                "meta_q_value": _masked_mean(meta_value, meta_steps),
-                "trained_steps": sub_steps.sum(),
-                "priority": sequence_priority(
-                    torch.cat([sub_value - sub_target, meta_value - meta_target], -1),
-                    torch.cat([sub_steps, meta_steps], -1),
-                ),
-            }
-        losses = {"loss": sub_loss + meta_loss, "sub_loss": sub_loss.detach(), "meta_loss": meta_loss.detach()}
+        losses = [self._distance(*of_level, weight) for of_level in zip(values, wanted, trained, strict=True)]
+        loss = torch.stack(losses).sum()
+        report = self._report(losses, values, wanted, trained)
         if self._predicts:
-            prediction_error = self._prediction_loss(memory, tensordict, valid)
-            losses["loss"] = losses["loss"] + self.prediction_weight * prediction_error
-            losses["prediction_loss"] = prediction_error.detach()
-        return TensorDict({**losses, **report}, [])
+            prediction_error = self._prediction_loss(
+                memory,
+                action,
+                tensordict[self._networks[0].observation_key],
+                valid=valid,
+                cut=init[:, 1:],
+            )
+            loss = loss + self.prediction_weight * prediction_error
+            report["prediction_loss"] = prediction_error.detach()
+        return TensorDict({"loss": loss, **report}, [])
 
-    @property
-    def _predicts(self) -> bool:
-        return self._policies[0].network.predictor is not None and self.prediction_weight > 0.0
+    @torch.no_grad()
+    def _report(
+        self, losses: list[Tensor], values: list[Tensor], wanted: list[Tensor], trained: list[Tensor]
+    ) -> dict[str, Tensor]:
+        """Figures of each level; those of level 0 have plain names."""
+        report = {"target": masked_mean(wanted[0], trained[0]), "trained_steps": trained[0].sum()}
+        errors = [value - target for value, target in zip(values, wanted, strict=True)]
+        for index, rule in enumerate(self.rules):
+            prefix = f"{rule.name}_" if index else ""
+            report[f"{rule.name}_loss"] = losses[index].detach()
+            report[f"{prefix}td_error"] = masked_mean(errors[index].abs(), trained[index])
+            report[f"{prefix}q_value"] = masked_mean(values[index], trained[index])
+        report["priority"] = sequence_priority(torch.cat(errors, -1), torch.cat(trained, -1))
+        return report
 
-    def _prediction_loss(self, memory: Tensor, tensordict: TensorDictBase, valid: Tensor) -> Tensor:
-        """Mean error of predictions within an episode."""
-        policy = self._policies[0]
-        return prediction_loss(
-            policy.network.predictor,
-            memory,
-            tensordict[self.tensor_keys.action],
-            tensordict[policy.observation_key],
-            valid=valid,
-            cut=tensordict[policy.init_key].squeeze(-1)[:, 1:],
-        )
-
-    def _values(self, tensordict: TensorDictBase) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], Tensor]:
-        """Q-values of both levels, ``[B, T + 1, G, A]`` and ``[B, T + 1, G]``, by main and target network; the main
-        network's memory ``[B, T + 1, H]``."""
-        policy, target_policy = self._policies
-        read = (policy.observation_key, policy.previous_action_key, policy.init_key, policy.mask_key)
+    def _values(self, tensordict: TensorDictBase) -> tuple[Values, Values, Tensor]:
+        """Q-values of all levels ``[B, T + 1, C, X]`` by main and target network; the main network's memory
+        ``[B, T + 1, H]``."""
+        policy = self._networks[0]
+        read = (policy.observation_key, policy.previous_action_key, policy.init_key, *policy.mask_keys)
         inputs = tensordict.select(*read, *self.state_keys)
 
-        def run(which: AllSubgoalsPolicy) -> tuple[Tensor, Tensor, Tensor]:
-            values = which(inputs.copy())
-            written = (which.action_value_key, which.subgoal_value_key, which.hidden_key)
-            return tuple(values.get(key) for key in written)  # type: ignore[return-value]
+        def run(which: AllSubgoalsPolicy) -> tuple[Values, Tensor]:
+            written = which(inputs.copy())
+            return tuple(written.get(key) for key in which.value_keys), written.get(which.hidden_key)
 
         with set_recurrent_mode(True):
             with torch.no_grad():
-                target = run(target_policy)[:2]
-            *online, memory = run(policy)
-            return tuple(online), target, memory  # type: ignore[return-value]
+                target, _ = run(self._networks[1])
+            online, memory = run(policy)
+            return online, target, memory
 
-    def _valid(self, tensordict: TensorDictBase) -> Tensor:
-        """Which steps are no padding, ``[B, T + 1]`` bool."""
-        mask = tensordict.get(self.tensor_keys.mask, None)
-        return torch.ones(tensordict.shape, dtype=torch.bool, device=tensordict.device) if mask is None else mask
-
-    def _events(self, steps: TensorDictBase, valid: Tensor) -> dict[str, Tensor]:
-        """What each step ``[B, T]`` led to, as far as it does not depend on values."""
-        k, after = self.tensor_keys, steps["next"]
-        attained = after[k.attained]
+    def _events(self, tensordict: TensorDictBase, valid: Tensor) -> StepEvents:
+        """What each step ``[B, T]`` led to, apart from subgoals."""
+        k, after = self.tensor_keys, tensordict[:, :-1]["next"]
         done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
         last = valid[:, :-1] & ~valid[:, 1:]  # before padding
-        reward = self.rewards.of_all(attained, after[k.hazard] if self.rewards.hazard else None)
-        return {
-            "attained": attained,
-            "sub_reward": reward,
-            "extrinsic_reward": after[k.extrinsic_reward].expand_as(reward),
-            "sub_end": attained | terminated.unsqueeze(-1),
-            "meta_end": terminated.unsqueeze(-1).expand_as(attained),
-            # Cut off by a time limit, or by the sequence's end: what follows is not in the sequence.
-            "unseen": ((done | last) & ~terminated).unsqueeze(-1).expand_as(attained),
-        }
+        reward = after[k.extrinsic_reward]
+        if self.bonus_reward:
+            reward = reward + self.bonus_reward * after[k.bonus].sum(-1, keepdim=True)
+        return StepEvents(
+            terminated=terminated,
+            unseen=(done | last) & ~terminated,
+            reward=reward,
+            hazard=after[k.hazard] if self.reads_hazard else None,
+        )
 
-    def _targets(
-        self,
-        online: tuple[Tensor, Tensor],
-        target: tuple[Tensor, Tensor],
-        tensordict: TensorDictBase,
-        events: dict[str, Tensor],
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Targets of both levels ``[B, T, G]``, and whether each option agrees with the action, ``[B, T, G]`` bool."""
-        mask = tensordict[self._policies[0].mask_key]
-        chooser = online if self.double else target
-        sub_next = double_q_value(chooser[0], target[0])[:, 1:]
-        best_next = double_q_value(chooser[1], target[1], mask)[:, 1:].unsqueeze(-1).expand_as(sub_next)
-        agrees = online[0].argmax(-1) == tensordict[self.tensor_keys.action].unsqueeze(-1)  # [B, T + 1, G]
-        trace = watkins_trace(agrees, self.trace_decay)[:, :-1].masked_fill(events["unseen"], 0.0)
-        if self.intra_option:
-            meta_next = torch.where(events["attained"], best_next, target[1][:, 1:])
-            meta_trace = trace.masked_fill(events["attained"], 0.0)
-        else:
-            meta_next, meta_trace = best_next, self._option_trace(online[1], tensordict, events)
-        # One recursion serves both levels, as columns beside each other.
-        unseen = torch.cat([events["unseen"] & ~events["attained"], events["unseen"]], -1)
-        trace = torch.cat([trace, meta_trace], -1)
-        trace[:, :-1].masked_fill_(unseen[:, 1:], 0.0)  # there is no target to take over
-        reward = torch.cat([events["sub_reward"], events["extrinsic_reward"]], -1)
-        ended = torch.cat([events["sub_end"], events["meta_end"]], -1) | unseen
-        discount = torch.ones_like(sub_next)
-        discount = torch.cat([self.sub_gamma * discount, self.meta_gamma * discount], -1)
-        following = torch.cat([sub_next, meta_next], -1)
-        returns = lambda_returns(reward, ended, following, trace, discount)
-        sub_target, meta_target = returns.chunk(2, -1)
-        meta_target = meta_target.clamp(min=self.min_meta_target, max=self.max_meta_target)
-        return sub_target.clamp(max=self.max_sub_target), meta_target, agrees[:, :-1]
-
-    def _option_trace(self, subgoal_value: Tensor, tensordict: TensorDictBase, events: dict[str, Tensor]) -> Tensor:
-        """Traces ``[B, T, G]`` along options: all inside them; lambda to the next one, if it is the greedy choice and
-        seen to its end."""
-        k = self.tensor_keys
-        greedy = mask_values(subgoal_value, tensordict[self._policies[0].mask_key]).argmax(-1)
-        agrees = greedy == tensordict["next", k.active_subgoal]
-        to_next = watkins_trace(agrees, self.trace_decay)[:, :-1]
-        to_next[:, :-1] *= self._ends_in_sequence(tensordict, events)[:, 1:].squeeze(-1)
-        trace = torch.where(tensordict[k.option_init].squeeze(-1)[:, 1:], to_next, 1.0)
-        return trace.unsqueeze(-1).repeat(1, 1, subgoal_value.shape[-1])
-
-    def _trained(
-        self, tensordict: TensorDictBase, valid: Tensor, events: dict[str, Tensor], agrees: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Which entries ``[B, T, G]`` enter the losses of the sub level and of the meta level."""
-        k, policy, steps = self.tensor_keys, self._policies[0], tensordict[:, :-1]
-        init = steps[policy.init_key].squeeze(-1)
-        warm = training_mask(valid, init, self.burn_in, self.train_exact_states, self.lookahead - 1)  # [B, T]
-        left = steps[policy.mask_key] & warm.unsqueeze(-1)
-        pursued = steps["next", k.active_subgoal].unsqueeze(-1) == torch.arange(left.shape[-1], device=left.device)
-        sub_steps = left & (~events["unseen"] | events["attained"])
-        meta_steps = left & ~events["unseen"] & (agrees | pursued)
-        if not self.all_subgoals:
-            sub_steps, meta_steps = sub_steps & pursued, meta_steps & pursued
-        if not self.intra_option:
-            whole = self._ends_in_sequence(tensordict, events)
-            meta_steps = meta_steps & pursued & steps[k.option_init] & whole
-        return sub_steps, meta_steps
-
-    def _ends_in_sequence(self, tensordict: TensorDictBase, events: dict[str, Tensor]) -> Tensor:
-        """Steps ``[B, T, 1]`` whose option ends within the sequence, what it led to included."""
-        seen = ~events["unseen"][..., :1]
-        ends = (tensordict[self.tensor_keys.option_init][:, 1:] | events["meta_end"][..., :1]) & seen
-        found = [torch.zeros_like(ends[:, 0])]
-        for end, visible in zip(reversed(ends.unbind(1)), reversed(seen.unbind(1)), strict=True):
-            found.append(end | (found[-1] & visible))
-        return torch.stack(found[:0:-1], 1)
-
-    def _distance(self, value: Tensor, target: Tensor, mask: Tensor, weight: Tensor | None) -> Tensor:
-        """Mean loss over ``mask``; sequences drawn by priority have a ``weight`` ``[B, T]``."""
-        error = (value - target).masked_fill(~mask, 0.0)
-        distance = distance_loss(error, torch.zeros_like(error), self.loss_function)
-        if weight is not None:
-            distance = distance * importance_weight(weight)[:, None, None]
-        return distance.sum() / mask.sum().clamp(min=1)
+    def _wanted(self, columns: list[Columns]) -> list[Tensor]:
+        """The targets of each level ``[B, T, C * X]``: one recursion serves all, as columns beside each other."""
+        returns = lambda_returns(
+            torch.cat([each.reward for each in columns], -1),
+            torch.cat([each.ended for each in columns], -1),
+            torch.cat([each.next_value for each in columns], -1),
+            torch.cat([each.trace for each in columns], -1),
+            torch.cat([each.discount for each in columns], -1),
+        ).split([each.reward.shape[-1] for each in columns], -1)
+        return [
+            each.clamp(min=rule.smallest_return, max=rule.largest_return)
+            for each, rule in zip(returns, self.rules, strict=True)
+        ]
 
 
-def _masked_mean(value: Tensor, mask: Tensor) -> Tensor:
-    return value.masked_fill(~mask, 0.0).sum() / mask.sum().clamp(min=1)
+def _chosen(online: Values, action: Tensor) -> list[Tensor]:
+    """The values that are trained, ``[B, T, C]`` of the actions taken and ``[B, T, C * X]`` of all subgoals."""
+    taken = action[:, :-1, None, None].expand(*online[0][:, :-1].shape[:-1], 1)
+    return [online[0][:, :-1].gather(-1, taken).squeeze(-1), *(value[:, :-1].flatten(-2) for value in online[1:])]

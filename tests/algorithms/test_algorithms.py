@@ -128,7 +128,7 @@ class TestBoundsOfTargets:
 
     def bound(self, algorithm, level):
         loss = algorithm.learners[level].loss
-        return getattr(loss, "max_meta_target" if level == "joint" else "max_target")
+        return loss.rules[-1].largest_return if level == "joint" else loss.max_target
 
     @pytest.mark.parametrize(("name", "level"), [("dqn", "flat"), ("drqn", "flat"), ("v1", "meta"), ("v2", "meta")])
     def test_the_grid_states_that_a_goal_pays_one(self, name, level):
@@ -139,13 +139,14 @@ class TestBoundsOfTargets:
 
     def test_the_grid_bounds_v3_on_both_sides(self):
         loss = build("v3", small_env(2, num_goals=3)).learners["joint"].loss
-        assert (loss.min_meta_target, loss.max_meta_target, loss.max_sub_target) == (0.0, 3.0, 1.0)
-        assert build("v3", small_env(2), max_meta_target=0.5).learners["joint"].loss.max_meta_target == 0.5
+        sub, meta = loss.rules
+        assert (meta.smallest_return, meta.largest_return, sub.largest_return) == (0.0, 3.0, 1.0)
+        assert build("v3", small_env(2), max_meta_target=0.5).learners["joint"].loss.rules[1].largest_return == 0.5
 
     @pytest.mark.parametrize(("rewards", "bound"), [({}, 1.0), ({"wrong_subgoal_reward": 0.5}, math.inf)])
     def test_reaching_a_subgoal_pays_one_unless_more_is_paid(self, rewards, bound):
         assert self.bound(build("v2", small_env(2), **rewards), "sub") == bound
-        assert build("v3", small_env(2), **rewards).learners["joint"].loss.max_sub_target == bound
+        assert build("v3", small_env(2), **rewards).learners["joint"].loss.rules[0].largest_return == bound
 
     @pytest.mark.parametrize("name", ["dqn", "v1", "v3"])
     def test_an_environment_that_says_nothing_is_not_bounded_by_the_name_of_an_argument(self, name):
@@ -169,7 +170,7 @@ class TestBoundsOfTargets:
         assert self.bound(build("drqn", env), "flat") == 40.0
         assert self.bound(build("v2", env), "meta") == 20.0
         loss = build("v3", env).learners["joint"].loss
-        assert (loss.min_meta_target, loss.max_meta_target) == (-5.0, 20.0)
+        assert (loss.rules[-1].smallest_return, loss.rules[-1].largest_return) == (-5.0, 20.0)
 
 
 class TestSequencesOfV3:
@@ -215,9 +216,11 @@ class TestSequencesOfV3:
         for _ in range(16):
             sample = learner.sample()
             sample["subgoal_mask"].fill_(True)  # both ends are soon attained, and nothing is left to learn about
-            loss, valid = learner.loss, sample["collector", "mask"][:, :-1]
-            events = loss._events(sample[:, :-1], sample["collector", "mask"])
-            trained = loss._trained(sample, valid, events, torch.ones_like(events["attained"]))[0].any(-1)
+            loss, valid = learner.loss, sample["collector", "mask"]
+            (online, target, _), events = loss._values(sample), loss._events(sample, valid)
+            columns = loss.targets.columns(online, target, sample["action"], sample, events)
+            warm = loss._warm(valid[:, :-1], sample["is_init"].squeeze(-1)[:, :-1], loss.lookahead - 1)
+            trained = columns[0].trained.any(-1) & warm
             assert (trained.sum(-1) <= 32).all()
             counts += (sample["index"][:, :-1, 0] % 400)[trained].bincount(minlength=400)
         assert (counts[:399] > 0).all() and counts[50:].sum() > 6 * counts[:50].sum()
@@ -622,21 +625,21 @@ class TestV3:
         assert all((stored[key] == batch[key]).all() for key in stored.keys(True, True))
 
     @pytest.mark.parametrize(
-        ("name", "value"),
+        ("name", "value", "read"),
         [
-            ("sub_gamma", 0.5),
-            ("meta_gamma", 0.5),
-            ("trace_decay", 0.25),
-            ("all_subgoals", False),
-            ("intra_option", False),
-            ("wrong_subgoal_reward", -0.25),
-            ("hazard_reward", -0.75),
-            ("max_meta_target", 1.5),
+            ("sub_gamma", 0.5, lambda loss: loss.rules[0].gamma),
+            ("meta_gamma", 0.5, lambda loss: loss.rules[1].gamma),
+            ("trace_decay", 0.25, lambda loss: loss.targets.trace_decay),
+            ("all_subgoals", False, lambda loss: loss.targets.all_subgoals),
+            ("intra_option", False, lambda loss: loss.targets.intra_option),
+            ("wrong_subgoal_reward", -0.25, lambda loss: loss.rules[0].rewards.wrong_subgoal),
+            ("hazard_reward", -0.75, lambda loss: loss.rules[0].rewards.hazard),
+            ("max_meta_target", 1.5, lambda loss: loss.rules[1].largest_return),
         ],
     )
-    def test_options_of_the_loss(self, name, value):
+    def test_options_of_the_loss(self, name, value, read):
         default, changed = (self.make(**options).learners["joint"].loss for options in ({}, {name: value}))
-        assert getattr(default, name) != getattr(changed, name) == value
+        assert read(default) != read(changed) == value
 
     def test_double(self):
         for double in (True, False):
@@ -647,7 +650,7 @@ class TestV3:
         network = algorithm.policy.network
         assert (network.hidden_size, network.sub_head[0].out_features, network.joint) == (9, 7, False)
         assert self.make().policy.network.joint
-        assert (network.num_actions, network.num_subgoals) == (4, 2)
+        assert (network.num_actions, network.num_subgoals) == (4, (2,))
 
     def test_rewards_and_discount_reach_the_option_book(self):
         _, batch = self.steps(wrong_subgoal_reward=-0.25, hazard_reward=-0.75, meta_gamma=0.5)

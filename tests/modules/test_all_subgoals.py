@@ -8,6 +8,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
 from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
     AllSubgoalsPolicy,
@@ -37,11 +38,22 @@ def sequences(rows=3, steps=9):
     return observation, action, init, mask
 
 
+def unroll(network, observation, action, init, mask, state=None):
+    """Values of both levels, and the memory's output."""
+    (action_value, subgoal_value), memory = network.unroll(observation, action, init, [mask], state)
+    return action_value, subgoal_value.squeeze(-2), memory
+
+
+def step(network, observation, action, init, mask, state):
+    (action_value, subgoal_value), state = network.step(observation, action, init, [mask], state)
+    return action_value, subgoal_value.squeeze(-2), state
+
+
 def step_by_step(network, observation, action, init, mask, state):
     """What ``unroll`` computes, as single decisions."""
     values = []
     for t in range(observation.shape[1]):
-        *value, state = network.step(observation[:, t], action[:, t], init[:, t], mask[:, t], state)
+        *value, state = step(network, observation[:, t], action[:, t], init[:, t], mask[:, t], state)
         values.append(value)
     return [torch.stack(parts, 1) for parts in zip(*values, strict=True)]
 
@@ -52,10 +64,10 @@ class TestNetwork:
         network, inputs = make_network(), sequences()
         inputs[2][:, 0] = from_the_start
         state = tuple(torch.randn(2, 3, 5))
-        unrolled = network.unroll(*inputs, state)
+        unrolled = unroll(network, *inputs, state)
         for found, expected in zip(unrolled[:2], step_by_step(network, *inputs, state), strict=True):
             torch.testing.assert_close(found, expected, **EXACT)
-        from_zero = network.unroll(*inputs)
+        from_zero = unroll(network, *inputs)
         same = all((a == b).all() for a, b in zip(unrolled, from_zero, strict=True))
         assert same == from_the_start
 
@@ -64,34 +76,34 @@ class TestNetwork:
         init = torch.tensor([True, False])
         state = tuple(torch.randn(2, 2, 5))
         batch = observation[:, 1], action[:, 1], init, mask[:, 1]
-        whole = network.step(*batch, state)
+        whole = step(network, *batch, state)
         for row in range(2):
-            single = network.step(*(entry[row] for entry in batch), tuple(part[row] for part in state))
+            single = step(network, *(entry[row] for entry in batch), tuple(part[row] for part in state))
             for found, expected in zip((*single[:2], *single[2]), (*whole[:2], *whole[2]), strict=True):
                 torch.testing.assert_close(found, expected[row], **EXACT)
 
     def test_an_episode_depends_on_nothing_before_it(self):
         network, (observation, action, init, mask) = make_network(), sequences()
-        before = network.unroll(observation, action, init, mask)
+        before = unroll(network, observation, action, init, mask)
         observation[:, :4], mask[:, :4] = torch.randn(3, 4, 2), True
         action[:, :5] = (action[:, :5] + 1) % ACTIONS  # that of the last step before, too
-        for old, new in zip(before, network.unroll(observation, action, init, mask), strict=True):
+        for old, new in zip(before, unroll(network, observation, action, init, mask), strict=True):
             assert (old[:, 4:] == new[:, 4:]).all() and (old[:, :4] != new[:, :4]).any()
 
     def test_within_an_episode_past_observations_and_actions_count(self):
         network, (observation, action, init, mask) = make_network(), sequences()
         init[:, 1:] = False
-        before = network.unroll(observation, action, init, mask)[0]
+        before = unroll(network, observation, action, init, mask)[0]
         other = observation.clone()
         other[:, 0] += 1
-        assert (before != network.unroll(other, action, init, mask)[0]).flatten(2).any(-1).all()
+        assert (before != unroll(network, other, action, init, mask)[0]).flatten(2).any(-1).all()
         action[:, 3] = (action[:, 3] + 1) % ACTIONS
-        differs = (before != network.unroll(observation, action, init, mask)[0]).flatten(2).any(-1)
+        differs = (before != unroll(network, observation, action, init, mask)[0]).flatten(2).any(-1)
         assert differs[:, 3:].all() and not differs[:, :3].any()
 
     def test_the_mask_concerns_the_meta_level_only(self):
         network, (observation, action, init, mask) = make_network(), sequences()
-        before, after = (network.unroll(observation, action, init, which) for which in (mask, ~mask))
+        before, after = (unroll(network, observation, action, init, which) for which in (mask, ~mask))
         assert (before[0] == after[0]).all() and (before[1] != after[1]).any(-1).all()
 
     def test_values_are_dueling(self):
@@ -100,7 +112,7 @@ class TestNetwork:
         streams = []
         for head in (network.sub_head, network.meta_head):
             head.register_forward_hook(lambda _module, _inputs, output: streams.append(output))
-        action_value, subgoal_value, _ = network.step(*(steps[0] for steps in inputs), network.initial_state(9))
+        action_value, subgoal_value, _ = step(network, *(steps[0] for steps in inputs), network.initial_state(9))
         sub, meta = streams[0].view(*action_value.shape[:-1], 1 + ACTIONS), streams[1]
         for value, stream in ((action_value, sub), (subgoal_value, meta)):
             torch.testing.assert_close(value.mean(-1), stream[..., 0], **EXACT)
@@ -109,7 +121,7 @@ class TestNetwork:
     @pytest.mark.parametrize("joint", [True, False])
     def test_only_a_joint_meta_level_trains_the_memory(self, joint):
         network = make_network(joint=joint)
-        network.unroll(*sequences())[1].sum().backward()
+        unroll(network, *sequences())[1].sum().backward()
         for part in (network.memory, network.features):
             assert any(p.grad is not None and (p.grad != 0).any() for p in part.parameters()) == joint
         assert all((p.grad != 0).any() for p in network.meta_head.parameters())
@@ -117,7 +129,7 @@ class TestNetwork:
 
     def test_joint_or_not_the_values_are_the_same(self):
         joint, apart = make_network(), make_network(joint=False)
-        for found, expected in zip(joint.unroll(*sequences()), apart.unroll(*sequences()), strict=True):
+        for found, expected in zip(unroll(joint, *sequences()), unroll(apart, *sequences()), strict=True):
             assert (found == expected).all()
 
     def test_sizes(self):
@@ -147,7 +159,7 @@ def root(rows=3, **entries):
 def values_at(policy, td):
     state = td["memory_hidden"], td["memory_cell"]
     read = (td["observation"], td["previous_action"], td["is_init"].squeeze(-1), td["subgoal_mask"])
-    return policy.network.step(*read, state)
+    return step(policy.network, *read, state)
 
 
 class TestPolicy:
@@ -222,20 +234,21 @@ class TestPolicy:
         out = policy(read.clone())
         assert set(policy.out_keys) == set(out.keys(True, True)) - set(read.keys(True, True))
 
-    def test_every_key_can_be_nested(self):
+    def test_keys_can_be_others_and_nested(self):
         plain = AllSubgoalsPolicy(make_network(), RepeatingEpsilonGreedy())
-        read = {name: ("agent", name.removesuffix("_key")) for name in vars(plain) if name.endswith("_key")}
-        names = {getattr(plain, name): key[1] for name, key in read.items()}
-        assert len(names) == 14
-        moved = AllSubgoalsPolicy(plain.network, plain.sub_exploration, **read)
+        own = ("observation", "previous_action", "is_init", "action", "memory_hidden", "memory_cell", "repeated_action")
+        arguments = {"is_init": "init_key", "memory_hidden": "hidden_key", "memory_cell": "cell_key"}
+        arguments["repeated_action"] = "exploration_key"
+        read = {arguments.get(name, f"{name}_key"): ("agent", name) for name in own}
+        moved = AllSubgoalsPolicy(plain.network, plain.sub_exploration, subgoal_keys=[OptionKeys("rooms")], **read)
         td = root(option_init=torch.tensor([[False], [True], [False]]))
-        agent = TensorDict({names[key]: value for key, value in td.items()}, batch_size=3)
-        out, expected = moved(TensorDict(agent=agent, batch_size=3)), plain(td)
+        renamed = {("agent", key) if key in own else f"rooms_{key}": value for key, value in td.items()}
+        out, expected = moved(TensorDict(renamed, batch_size=3)), plain(td)
         assert (out["agent", "action"] == expected["action"]).all()
-        assert (out["agent", "subgoal"] == expected["subgoal"]).all()
+        assert (out["rooms_subgoal"] == expected["subgoal"]).all()
         for key in ("memory_hidden", "memory_cell", "previous_action", "repeated_action"):
-            assert (out["next", "agent", names[key]] == expected["next", key]).all()
-            assert ("agent", names[key]) in moved.make_tensordict_primer().primers.keys(True, True)
+            assert (out["next", "agent", key] == expected["next", key]).all()
+            assert ("agent", key) in moved.make_tensordict_primer().primers.keys(True, True)
 
     def test_learning_writes_all_values_and_chooses_nothing(self):
         policy, (observation, action, init, mask) = AllSubgoalsPolicy(make_network()), sequences()
@@ -243,8 +256,8 @@ class TestPolicy:
         td["is_init"] = init.unsqueeze(-1)
         with set_recurrent_mode(True):
             out = policy(td)
-        expected = policy.network.unroll(observation, action, init, mask)
-        assert (out["action_value"] == expected[0]).all() and (out["subgoal_value"] == expected[1]).all()
+        expected = unroll(policy.network, observation, action, init, mask)
+        assert (out["action_value"] == expected[0]).all() and (out["subgoal_value"].squeeze(-2) == expected[1]).all()
         assert "action" not in out and "next" not in out
 
     def test_everything_stays_on_the_device(self):
@@ -254,7 +267,9 @@ class TestPolicy:
         with set_exploration_type(ExplorationType.RANDOM):
             out = policy(root().to("meta"))
         assert out["action"].device.type == out["next", "repeated_action"].device.type == "meta"
-        assert all(value.device.type == "meta" for value in policy.network.unroll(*(x.to("meta") for x in sequences())))
+        assert all(
+            value.device.type == "meta" for value in unroll(policy.network, *(x.to("meta") for x in sequences()))
+        )
 
 
 def test_values_of():
@@ -284,14 +299,15 @@ class TestInTheEnvironment:
         with set_exploration_type(kind), torch.no_grad():
             batch = self.algorithm.transform(env).rollout(steps, policy, break_when_any_done=False)
         batch["collector", "traj_ids"] = batch["is_init"].squeeze(-1).cumsum(-1) + 100 * torch.arange(5)[:, None]
-        self.action_value, self.subgoal_value = (torch.stack([value[i] for value in acted_by], 1) for i in (0, 1))
+        values = [torch.stack(of_level, 1) for of_level in zip(*(values for values, _ in acted_by), strict=True)]
+        self.action_value, self.subgoal_value = values[0], values[1].squeeze(-2)
         assert self.action_value.shape == (5, steps, 2, 4)
         return batch
 
     def unrolled(self, batch):
         with set_recurrent_mode(True), torch.no_grad():
             out = self.algorithm.policy(batch.clone())
-        return out["action_value"], out["subgoal_value"]
+        return out["action_value"], out["subgoal_value"].squeeze(-2)
 
     def test_whole_rollouts_unroll_to_the_values_acted_by(self):
         batch = self.play(max_option_steps=3)

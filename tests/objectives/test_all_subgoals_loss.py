@@ -68,12 +68,12 @@ class Tables(nn.Module):
 
     def __init__(self, steps, subgoals=G, actions=A):
         super().__init__()
-        self.num_subgoals = subgoals
+        self.num_subgoals = (subgoals,)
         self.action_value = nn.Parameter(torch.randn(steps, subgoals, actions))
         self.subgoal_value = nn.Parameter(torch.randn(steps, subgoals))
 
-    def unroll(self, observation, previous_action, init, mask, state=None):
-        return self.action_value[observation], self.subgoal_value[observation], observation
+    def unroll(self, observation, previous_action, init, masks, state=None):
+        return (self.action_value[observation], self.subgoal_value[observation].unsqueeze(-2)), observation
 
 
 def make_loss(steps=B * T, *, subgoals=G, actions=A, **settings):
@@ -484,7 +484,8 @@ class TestInTheEnvironment:
     def values(self, loss, td):
         """By the main and the target network, ``[B, T, G, A]`` and ``[B, T, G]`` each."""
         with torch.no_grad():
-            return [value for pair in loss._values(td)[:2] for value in pair]
+            pairs = loss._values(td)[:2]
+        return [part for sub, meta in pairs for part in (sub, meta.squeeze(-2))]
 
     @pytest.mark.parametrize(
         "settings",
@@ -519,8 +520,9 @@ class TestInTheEnvironment:
         loss(td)["loss"].backward()
         found = {name: p.grad.clone() for name, p in network.named_parameters()}
         network.zero_grad()
-        inputs = (td["observation"], td["previous_action"], td["is_init"].squeeze(-1), td["subgoal_mask"])
-        action_value, subgoal_value, _ = network.unroll(*inputs)
+        inputs = (td["observation"], td["previous_action"], td["is_init"].squeeze(-1), [td["subgoal_mask"]])
+        (action_value, subgoal_value), _ = network.unroll(*inputs)
+        subgoal_value = subgoal_value.squeeze(-2)
         total = 0.0
         for (b, t, g), error in sub.items():
             total = total + 2 * error / len(sub) * action_value[b, t, g, td["action"][b, t]]
@@ -619,13 +621,12 @@ class TestInTheEnvironment:
     def test_keys_can_be_others_and_nested(self):
         loss, td = self.sample()
         expected = loss(td)["loss"]
-        for key in ("action", "option_init"):
-            td[f"agent_{key}", "x"] = td.pop(key)
-        for key in ("attained", "hazard", "extrinsic_reward", "done", "terminated", "active_subgoal"):
+        td["agent_action", "x"] = td.pop("action")
+        for key in ("hazard", "extrinsic_reward", "done", "terminated"):
             td["next", f"agent_{key}", "x"] = td["next"].pop(key)
-        moved = {key: (f"agent_{key}", "x") for key in loss.default_keys.__dataclass_fields__}
+        moved = {key: (f"agent_{key}", "x") for key in ("action", "hazard", "extrinsic_reward", "done", "terminated")}
         loss.set_keys(**moved)
-        assert len(moved) == 10 and loss(td)["loss"] == expected
+        assert loss(td)["loss"] == expected
 
 
 def test_everything_stays_on_the_device():
@@ -657,6 +658,8 @@ def test_wrong_values(name, value):
     ("settings", "message"),
     [
         ({"lookahead": 0}, r"lookahead must be >= 1 step, got 0; "),
+        ({"middle_gamma": 2.0}, r"middle_gamma must lie in \[0, 1\], got 2.0; "),
+        ({"wrong_subgoal_reward": [0.0, -0.5]}, r"wrong_subgoal_reward must be one number, or one for each of 1 sets"),
         ({"burn_in": 1.0}, r"burn_in must lie in \[0, 1\), got 1.0; "),
         ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
     ],

@@ -56,8 +56,8 @@ def values_in_one_pass(name, policy, steps):
     if name == "v3":
         given = (steps[key][None] for key in ("previous_action", "is_init", "subgoal_mask"))
         previous, init, mask = given
-        actions, subgoals, _ = policy.network.unroll(observation, previous, init.squeeze(-1), mask)
-        return actions[0, torch.arange(len(steps)), steps["subgoal"]], subgoals[0, starts]
+        (actions, subgoals), _ = policy.network.unroll(observation, previous, init.squeeze(-1), [mask])
+        return actions[0, torch.arange(len(steps)), steps["subgoal"]], subgoals[0, starts, 0]
     inputs = steps[starts]["sub_hidden" if name == "v2" else "observation"][None]
     actions = policy.sub_controller.network.unroll(observation, steps["subgoal"][None], starts[None])
     return actions[0], policy.meta_controller.network.unroll(inputs)[0]

@@ -1,0 +1,58 @@
+"""The option books of an agent: one :class:`~hdrqn_torchrl.transforms.SubgoalTransform` for each set of subgoals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms.requirements import Requirements
+from hdrqn_torchrl.transforms import SubgoalTransform
+
+
+def make_books(
+    has: Requirements,
+    *,
+    gamma: float,
+    max_option_steps: int | None = None,
+    hazard_reward: float = -1.0,
+    wrong_subgoal_reward: float | Sequence[float] = 0.0,
+    repeatable: bool | None = None,
+) -> list[SubgoalTransform]:
+    """The books in the order in which they stand in the environment: the farther before the nearer.
+
+    The end of a farther option ends the nearer one, and an option of a nearer set collects the intrinsic reward of the
+    farther one.
+
+    Args:
+        has: what the environment has.
+        gamma: discount inside options.
+        max_option_steps: step limit of the nearest options.
+        hazard_reward, wrong_subgoal_reward: of the critic; the latter for all sets, or for each from near to far.
+        repeatable: whether subgoals of the farthest set can be attained again; ``None``: as the task states it.
+    """
+    penalties = [wrong_subgoal_reward] * len(has.subgoals)
+    if not isinstance(wrong_subgoal_reward, (int, float)):
+        penalties = list(wrong_subgoal_reward)
+    books: list[SubgoalTransform] = []
+    above: keys.OptionKeys | None = None
+    levels = zip(has.subgoals, has.available_keys, penalties, strict=True)
+    for index, (subgoals, available_key, penalty) in reversed(list(enumerate(levels))):
+        names = subgoals.keys
+        is_top = above is None
+        books.append(
+            SubgoalTransform(
+                len(subgoals),
+                prefix=subgoals.prefix,
+                upper_done_key=None if above is None else above.option_done,
+                gamma=gamma,
+                max_option_steps=max_option_steps if index == 0 else None,
+                hazard_reward=hazard_reward,
+                wrong_subgoal_reward=penalty,  # type: ignore[arg-type]
+                repeatable=subgoals.repeatable if repeatable is None or not is_top else repeatable,
+                available_key=available_key,
+                hazard_key=has.hazard_key,
+                extrinsic_reward_key=keys.EXTRINSIC_REWARD if above is None else above.intrinsic_reward,
+            )
+        )
+        above = names
+    return books

@@ -1,0 +1,279 @@
+"""What one level of hDRQNv3 learns from each step of a sequence: the rule of :mod:`.all_subgoals`, level by level.
+
+``B`` sequences, ``T`` steps and one more that only values what came before; ``C`` subgoals that the level can be told
+to reach, ``X`` choices that it has. At level 0, of all actions only the one taken has a column.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from hdrqn_torchrl.keys import OptionKeys
+from hdrqn_torchrl.objectives.targets import double_q_value, greedy_choice, watkins_trace
+from hdrqn_torchrl.transforms import IntrinsicReward
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelRule:
+    """What a level chooses among, what it pursues, and what that pays.
+
+    Args:
+        name: of its figures in the loss's report.
+        gamma: discount of one environment step.
+        choices: entries of the subgoals that it chooses among; ``None``: actions.
+        pursues: entries of the subgoals that it is told to reach; ``None``: the task.
+        rewards: what reaching them pays; ``None`` at the top.
+        largest_return, smallest_return: bounds of its targets.
+    """
+
+    name: str
+    gamma: float
+    choices: OptionKeys | None
+    pursues: OptionKeys | None
+    rewards: IntrinsicReward | None = None
+    largest_return: float = math.inf
+    smallest_return: float = -math.inf
+
+
+@dataclass(frozen=True, kw_only=True)
+class StepEvents:
+    """What each step ``[B, T]`` led to, apart from subgoals.
+
+    Args:
+        terminated: the episode ended there, bool.
+        unseen: what follows is not in the sequence: cut off by a time limit, or by the sequence's end; bool.
+        reward: the task's, ``[B, T, 1]``.
+        hazard: ``[B, T, 1]`` bool; ``None``: not read.
+    """
+
+    terminated: Tensor
+    unseen: Tensor
+    reward: Tensor
+    hazard: Tensor | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Columns:
+    """The parts of a level's targets (:func:`~hdrqn_torchrl.objectives.targets.lambda_returns`), ``[B, T, C * X]``."""
+
+    reward: Tensor
+    ended: Tensor
+    next_value: Tensor
+    trace: Tensor
+    discount: Tensor
+    trained: Tensor
+    """bool: entries that learn."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelTargets:
+    """Turns the values of all levels into the parts of their targets.
+
+    Args:
+        rules: of each level, from level 0 up.
+        trace_decay: lambda.
+        double: Double Q-learning.
+        all_subgoals, intra_option: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+    """
+
+    rules: Sequence[LevelRule]
+    trace_decay: float
+    double: bool
+    all_subgoals: bool
+    intra_option: bool
+
+    def columns(
+        self,
+        online: Sequence[Tensor],
+        target: Sequence[Tensor],
+        action: Tensor,
+        tensordict: TensorDictBase,
+        events: StepEvents,
+    ) -> list[Columns]:
+        """The columns of every level.
+
+        Args:
+            online, target: Q-values of each level by main and target network, ``[B, T + 1, C, X]``.
+            action: what was done, ``[B, T + 1]`` int64.
+            tensordict: the sequences ``[B, T + 1]``.
+            events: what their steps led to.
+        """
+        agrees = online[0].argmax(-1) == action.unsqueeze(-1)  # [B, T + 1, C]: the greedy action for c is the one taken
+        found = [self._of_actions(self.rules[0], online[0], target[0], agrees, tensordict, events)]
+        for index, rule in enumerate(self.rules[1:], 1):
+            if index > 1:  # the greedy choice for c of the level below agrees
+                chosen = greedy_choice(online[index - 1], _mask(self.rules[index - 1], tensordict))
+                agrees = agrees.gather(-1, chosen)
+            found.append(self._of_subgoals(rule, online[index], target[index], agrees, tensordict, events))
+        return found
+
+    def _of_actions(
+        self,
+        rule: LevelRule,
+        online: Tensor,
+        target: Tensor,
+        agrees: Tensor,
+        tensordict: TensorDictBase,
+        events: StepEvents,
+    ) -> Columns:
+        """Level 0: every step attains its action, so that each is followed by the best one."""
+        best = double_q_value(online if self.double else target, target)[:, 1:]
+        trace = watkins_trace(agrees, self.trace_decay)[:, :-1]
+        trained = torch.ones_like(best, dtype=torch.bool)
+        return self._finish(rule, best.unsqueeze(-1), trace.unsqueeze(-1), trained.unsqueeze(-1), tensordict, events)
+
+    def _of_subgoals(
+        self,
+        rule: LevelRule,
+        online: Tensor,
+        target: Tensor,
+        agrees: Tensor,
+        tensordict: TensorDictBase,
+        events: StepEvents,
+    ) -> Columns:
+        """A level above the first: where x is not attained, its option goes on; ``agrees`` is ``[B, T + 1, X]``."""
+        assert rule.choices is not None
+        steps, names = tensordict[:, :-1], rule.choices
+        best = double_q_value(online if self.double else target, target, _mask(rule, tensordict))[:, 1:].unsqueeze(-1)
+        attained = steps["next", names.attained].unsqueeze(-2)  # [B, T, 1, X]
+        active = steps["next", names.active_subgoal].unsqueeze(-1)
+        pursued = active == torch.arange(online.shape[-1], device=active.device)
+        may_learn = agrees[:, :-1] | pursued
+        if not self.all_subgoals:
+            may_learn = may_learn & pursued
+        if self.intra_option:
+            following = torch.where(attained, best, target[:, 1:])
+            trace = watkins_trace(agrees, self.trace_decay)[:, :-1].unsqueeze(-2).masked_fill(attained, 0.0)
+        else:
+            whole = _ends_in_sequence(names, tensordict, events)
+            may_learn = may_learn & pursued & steps[names.option_init] & whole.unsqueeze(-1)
+            following = best
+            trace = self._option_trace(rule, online, whole, tensordict).unsqueeze(-1)
+        trained = (steps[names.subgoal_mask] & may_learn).unsqueeze(-2)
+        shape = target[:, 1:].shape
+        return self._finish(
+            rule, following.expand(shape), trace.expand(shape), trained.expand(shape), tensordict, events
+        )
+
+    def _finish(
+        self,
+        rule: LevelRule,
+        following: Tensor,
+        trace: Tensor,
+        trained: Tensor,
+        tensordict: TensorDictBase,
+        events: StepEvents,
+    ) -> Columns:
+        """Adds what depends on the pursued subgoal alone: reward, end, and which of them learn; ``[B, T, C, X]``."""
+        steps = tensordict[:, :-1]
+        reward, ended = events.reward, events.terminated.unsqueeze(-1)
+        if rule.pursues is not None and rule.rewards is not None:
+            attained = steps["next", rule.pursues.attained]  # [B, T, C]
+            reward, ended = rule.rewards.of_all(attained, events.hazard), ended | attained
+            trained = trained & steps[rule.pursues.subgoal_mask].unsqueeze(-1)
+            if not self.all_subgoals:
+                active = steps["next", rule.pursues.active_subgoal].unsqueeze(-1)
+                pursued = active == torch.arange(attained.shape[-1], device=active.device)
+                trained = trained & pursued.unsqueeze(-1)
+        unseen = events.unseen.unsqueeze(-1) & ~ended
+        trace = trace.masked_fill(events.unseen[..., None, None], 0.0)
+        trace[:, :-1].masked_fill_(unseen[:, 1:].unsqueeze(-1), 0.0)  # there is no target to take over
+        shape = following.shape
+
+        def spread(value: Tensor) -> Tensor:
+            return value.unsqueeze(-1).expand(shape).flatten(-2)
+
+        return Columns(
+            reward=spread(reward),
+            ended=spread(ended | unseen),
+            next_value=following.flatten(-2),
+            trace=trace.flatten(-2),
+            discount=torch.full(shape, rule.gamma, device=following.device).flatten(-2),
+            trained=(trained & ~unseen.unsqueeze(-1)).flatten(-2),
+        )
+
+    def _option_trace(self, rule: LevelRule, online: Tensor, whole: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Traces ``[B, T, C]`` along options: all inside them; lambda to the next one, if it is the greedy choice and
+        seen to its end."""
+        assert rule.choices is not None
+        names = rule.choices
+        active = tensordict["next", names.active_subgoal].unsqueeze(-1)
+        agrees = greedy_choice(online, _mask(rule, tensordict)) == active
+        to_next = watkins_trace(agrees, self.trace_decay)[:, :-1]
+        to_next[:, :-1] *= whole[:, 1:].unsqueeze(-1)
+        return torch.where(tensordict[names.option_init][:, 1:], to_next, 1.0)
+
+
+def make_rules(
+    subgoals: Sequence[OptionKeys],
+    *,
+    sub_gamma: float,
+    middle_gamma: float,
+    meta_gamma: float,
+    reached_reward: float,
+    wrong_subgoal_reward: float | Sequence[float],
+    hazard_reward: float,
+    largest_return: float,
+    smallest_return: float,
+) -> tuple[LevelRule, ...]:
+    """The rules of all levels of an agent, from level 0 up.
+
+    Args:
+        subgoals: entries of each set of subgoals, from near to far; none: one level.
+        sub_gamma, middle_gamma, meta_gamma: discounts of level 0, of those between, and of the top level above it.
+        reached_reward, hazard_reward: of the critic.
+        wrong_subgoal_reward: of the critic, for all sets or for each.
+        largest_return, smallest_return: of the task.
+
+    Raises:
+        ValueError: if there are not as many penalties as sets.
+    """
+    wrong = [wrong_subgoal_reward] * len(subgoals) if isinstance(wrong_subgoal_reward, (int, float)) else None
+    penalties = list(wrong_subgoal_reward) if wrong is None else wrong  # type: ignore[arg-type]
+    if len(penalties) != len(subgoals):
+        raise ValueError(
+            f"wrong_subgoal_reward must be one number, or one for each of {len(subgoals)} sets of subgoals from near "
+            f"to far, got {penalties}; give one number for all."
+        )
+    rules = []
+    for index, (choices, pursues) in enumerate(zip([None, *subgoals], [*subgoals, None], strict=True)):
+        gamma = sub_gamma if choices is None else meta_gamma if pursues is None else middle_gamma
+        name = "sub" if choices is None else "meta" if pursues is None else choices.prefix
+        rewards, smallest, largest = None, smallest_return, largest_return
+        if pursues is not None:
+            rewards = IntrinsicReward(reached=reached_reward, hazard=hazard_reward, wrong_subgoal=penalties[index])
+            smallest, largest = -math.inf, rewards.largest_return
+        rules.append(
+            LevelRule(
+                name=name,
+                gamma=gamma,
+                choices=choices,
+                pursues=pursues,
+                rewards=rewards,
+                largest_return=largest,
+                smallest_return=smallest,
+            )
+        )
+    return tuple(rules)
+
+
+def _mask(rule: LevelRule, tensordict: TensorDictBase) -> Tensor:
+    """The subgoals that the level can choose, ``[B, T + 1, 1, X]``."""
+    assert rule.choices is not None
+    return tensordict[rule.choices.subgoal_mask].unsqueeze(-2)
+
+
+def _ends_in_sequence(names: OptionKeys, tensordict: TensorDictBase, events: StepEvents) -> Tensor:
+    """Steps ``[B, T]`` whose option ends within the sequence, what it led to included."""
+    seen = ~events.unseen
+    ends = (tensordict[names.option_init].squeeze(-1)[:, 1:] | events.terminated) & seen
+    found = [torch.zeros_like(ends[:, 0])]
+    for end, visible in zip(reversed(ends.unbind(1)), reversed(seen.unbind(1)), strict=True):
+        found.append(end | (found[-1] & visible))
+    return torch.stack(found[:0:-1], 1)
