@@ -7,6 +7,8 @@ and among such paths it is the shortest.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
@@ -46,8 +48,9 @@ def plan(
     if search_cost is not None:
         start = torch.where(is_target.any(-1, keepdim=True), start, search_cost)
     entry = torch.where(codes == WALL, torch.inf, 1.0 + _LOSS * loss)
-    entry = entry.T.contiguous()  # [cells, N]: rows are copied whole, which is fast
-    cost = _cost_to_go(start.T.contiguous(), entry, rules.moves)
+    shape = rules.height, rules.width, len(agent)  # worlds last: lines of a map are then whole blocks of memory
+    entry, start = (each.T.contiguous().view(shape) for each in (entry, start))
+    cost, entry = _cost_to_go(start, entry).flatten(0, 1), entry.flatten(0, 1)
     world = torch.arange(len(agent), device=agent.device)
     choices, column = rules.moves[agent], world[:, None]  # [N, 4]
     pays = cost[agent, world] < _LOSS * (worth + 1)
@@ -55,23 +58,26 @@ def plan(
     return (entry[choices, column] + onward).argmin(-1)
 
 
-def _cost_to_go(start: Tensor, entry: Tensor, moves: Tensor) -> Tensor:
-    """Cost of the cheapest path from every cell to a target, by value iteration in all worlds at once.
+def _cost_to_go(start: Tensor, entry: Tensor) -> Tensor:
+    """Cost of the cheapest path from every cell to a target, in all worlds at once.
+
+    Value iteration that goes over the map line by line, in each of the four directions in turn: a cost travels a whole
+    corridor at a time, so that there are about as many rounds as a path has turns.
 
     Args:
-        start: cost of ending on a cell, infinite where it is no target, ``[cells, N]``.
-        entry: cost of entering a cell, ``[cells, N]``.
-        moves: cell after each action, ``[cells, 4]`` int64.
+        start: cost of ending on a cell, infinite where it is no target, ``[height, width, N]``.
+        entry: cost of entering a cell, infinite for walls, of the same shape.
 
     Returns:
-        ``[cells, N]``; infinite where no target can be reached.
+        The same shape; infinite where no target can be reached.
     """
-    cost = start
+    cost = start.clone()
     while True:
-        through = entry + cost
-        improved = start
-        for cells in moves.unbind(-1):
-            improved = torch.minimum(improved, through.index_select(0, cells))
-        if torch.equal(improved, cost):
+        before = cost.clone()
+        for axis in (0, 1):
+            lines = list(zip(cost.unbind(axis), entry.unbind(axis), strict=True))
+            for way in (lines, lines[::-1]):
+                for (behind, toll), (line, _) in pairwise(way):
+                    torch.minimum(line, behind + toll, out=line)
+        if torch.equal(before, cost):
             return cost
-        cost = improved

@@ -6,11 +6,14 @@ for all worlds at once. All but the random one follow cheapest paths (:mod:`~hdr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from time import monotonic
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs.utils import step_mdp
 
 from hdrqn_torchrl import keys
@@ -18,6 +21,8 @@ from hdrqn_torchrl.envs.grid.environment import MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid.planning import plan
 from hdrqn_torchrl.envs.grid.rules import ACTIONS
 from hdrqn_torchrl.envs.grid.searching import EgocentricSearch, PerfectMemorySearch
+
+_WORLDS = 250  # played at the same time: what is known of them then fits into a processor's cache
 
 Player = Callable[[TensorDictBase], TensorDictBase]
 PlayerName = Literal["planner", "memory", "egocentric", "random"]
@@ -75,22 +80,41 @@ PLAYERS: dict[PlayerName, Callable[[MultiGoalGridEnv], Player]] = {
 }
 
 
-def play_episodes(env: MultiGoalGridEnv, player: Player) -> dict[str, float]:
+def play_episodes(env: MultiGoalGridEnv, player: Player, *, seconds: float | None = None) -> dict[str, float]:
     """Plays one episode in every world of ``env``.
 
     Args:
         env: the environment; it is reset first.
         player: any policy that writes ``action``.
+        seconds: how long it may take; ``None``: as long as it takes.
 
     Returns:
         ``return_mean``, ``success_rate`` (share of episodes with all goals reached in order), ``steps_mean`` and
         ``episodes``.
+
+    Raises:
+        TimeoutError: if the time is up.
     """
+    played = _play(env, player, _deadline(seconds))
+    return _summary([played])
+
+
+class _Played(NamedTuple):
+    """One episode in each world, ``[N]`` each."""
+
+    returns: Tensor
+    success: Tensor
+    steps: Tensor
+
+
+def _play(env: MultiGoalGridEnv, player: Player, deadline: float) -> _Played:
     returns = torch.zeros(env.num_envs, dtype=torch.float64, device=env.device)
     steps, success = torch.zeros_like(returns), torch.zeros_like(returns)
     playing = torch.ones_like(returns)
     tensordict = env.reset()
     for _ in range(env.max_steps):
+        if monotonic() > deadline:
+            raise TimeoutError("the time for scripted players is up.")
         tensordict = env.step(player(tensordict))
         reward, done, won = (tensordict["next", key].squeeze(-1) for key in (keys.REWARD, keys.DONE, keys.SUCCESS))
         returns += playing * reward
@@ -100,11 +124,20 @@ def play_episodes(env: MultiGoalGridEnv, player: Player) -> dict[str, float]:
         if not playing.any():
             break
         tensordict = step_mdp(tensordict)
+    return _Played(returns, success, steps)
+
+
+def _deadline(seconds: float | None) -> float:
+    return math.inf if seconds is None else monotonic() + seconds
+
+
+def _summary(played: list[_Played]) -> dict[str, float]:
+    returns, success, steps = (torch.cat(column) for column in zip(*played, strict=True))
     return {
         "return_mean": returns.mean().item(),
         "success_rate": success.mean().item(),
         "steps_mean": steps.mean().item(),
-        "episodes": env.num_envs,
+        "episodes": len(returns),
     }
 
 
@@ -119,6 +152,7 @@ def scripted_ceiling(
     num_obstacles: int = 2,
     episodes: int = 1000,
     seed: int = 0,
+    seconds: float | None = None,
 ) -> dict[str, float]:
     """What a scripted player achieves on a task, by simulation.
 
@@ -130,8 +164,9 @@ def scripted_ceiling(
         max_steps: step limit of an episode.
         obstacle: ``"stay"`` or ``"teleport"``.
         num_obstacles: number of obstacles.
-        episodes: number of episodes, all played at once.
-        seed: seed of the worlds.
+        episodes: number of episodes; they are played in batches.
+        seed: seed of the worlds, which are the same for all players.
+        seconds: how long it may take; ``None``: as long as it takes.
 
     Returns:
         ``return_mean``, ``success_rate`` (share of episodes with all goals reached in order), ``steps_mean`` and
@@ -139,6 +174,7 @@ def scripted_ceiling(
 
     Raises:
         ValueError: if an argument breaks its rule.
+        TimeoutError: if the time is up.
 
     Examples:
         >>> scripted_ceiling("planner", episodes=100)["success_rate"]
@@ -148,14 +184,19 @@ def scripted_ceiling(
         raise ValueError(f"player must be one of {sorted(PLAYERS)}, got {player!r}.")
     if episodes < 1:
         raise ValueError(f"episodes must be >= 1, got {episodes}; use 1000 for an error of about 1 %.")
-    env = MultiGoalGridEnv(
-        episodes,
-        layout=layout,
-        num_goals=num_goals,
-        view=view,
-        max_steps=max_steps,
-        obstacle=obstacle,
-        num_obstacles=num_obstacles,
-        seed=seed,
-    )
-    return play_episodes(env, PLAYERS[player](env))
+    deadline, played = _deadline(seconds), []
+    for begun in range(0, episodes, _WORLDS):
+        env = MultiGoalGridEnv(
+            min(_WORLDS, episodes - begun),
+            layout=layout,
+            num_goals=num_goals,
+            view=view,
+            max_steps=max_steps,
+            obstacle=obstacle,
+            num_obstacles=num_obstacles,
+            places=False,
+            seed=seed + begun,
+        )
+        chosen = UniformRandom(env, seed + begun) if player == "random" else PLAYERS[player](env)
+        played.append(_play(env, chosen, deadline))
+    return _summary(played)

@@ -134,9 +134,7 @@ class _Memory:
     def __init__(self, rules: GridRules, worlds: int, walls: Tensor) -> None:
         cells, device = rules.nowhere, walls.device
         self._window_cells = rules.window_cells
-        self._visible = torch.zeros((cells, cells + 1), device=device).scatter_(1, rules.window_cells, 1.0)[:, :-1]
-        self._adjacent = torch.zeros((cells, cells), device=device).scatter_(1, rules.moves, 1 / len(ACTIONS))
-        self._adjacent.fill_diagonal_(0.0)  # a move that a wall stops leads to no neighbour
+        self._shape, self._view = (rules.height, rules.width), rules.view
         self._walls = torch.cat([walls, walls.new_ones(1)])  # windows show `nowhere` outside the map
         self._codes = torch.empty((worlds, cells + 1), dtype=torch.uint8, device=device)
         self._unseen = torch.empty((worlds, cells + 1), device=device)
@@ -174,8 +172,23 @@ class _Memory:
 
     def shown(self, weight: Tensor) -> Tensor:
         """Sum of ``weight`` ``[N, cells]`` over the window around each cell."""
-        return weight @ self._visible.T
+        return _in_window(_in_window(self._map(weight), self._view // 2), self._view // 2).flatten(1)
 
     def beside(self, weight: Tensor) -> Tensor:
-        """A fourth of the sum of ``weight`` ``[N, cells]`` over the neighbours of each cell."""
-        return weight @ self._adjacent.T
+        """A fourth of the sum of ``weight`` ``[N, cells]`` over the neighbours of each cell; walls must have none."""
+        around = pad(self._map(weight), (1, 1, 1, 1))
+        rows, columns = around[:, :, 1:-1], around[:, 1:-1]
+        return ((columns[..., :-2] + columns[..., 2:] + rows[:, :-2] + rows[:, 2:]) / len(ACTIONS)).flatten(1)
+
+    def _map(self, weight: Tensor) -> Tensor:
+        return weight.unflatten(1, self._shape)
+
+
+def _in_window(weight: Tensor, radius: int) -> Tensor:
+    """Sum over each line from ``radius`` cells before a cell to as many behind it; lines and columns change places."""
+    length = weight.shape[-1]
+    total = weight.clone()
+    for far in range(1, min(radius, length - 1) + 1):
+        total[..., far:] += weight[..., :-far]
+        total[..., :-far] += weight[..., far:]
+    return total.transpose(-1, -2)
