@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import random
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -45,6 +46,13 @@ CLOCK = ("wall_seconds", "frames_per_second", "updates_per_second")
 def small_env(num_envs: int = 4, **settings) -> MultiGoalGridEnv:
     """A 3x3 room with one obstacle and two goals; its episodes are short."""
     defaults = {"layout": ROOM, "num_obstacles": 1, "max_steps": 7, "view": 3, "seed": 0}
+    return MultiGoalGridEnv(num_envs, **(defaults | settings))
+
+
+def house(num_envs: int = 4, **settings) -> MultiGoalGridEnv:
+    """Two rooms with a door between them, which are nearer subgoals than the two goals."""
+    rows = ["#########", "#...#...#", "#.......#", "#...#...#", "#########"]
+    defaults = {"layout": rows, "places": True, "num_obstacles": 1, "max_steps": 7, "view": 3, "seed": 0}
     return MultiGoalGridEnv(num_envs, **(defaults | settings))
 
 
@@ -103,6 +111,7 @@ def make_training(
     seed: int = 0,
     learner: dict | None = None,
     options: dict | None = None,
+    worlds: Callable[..., MultiGoalGridEnv] = small_env,
     **settings,
 ) -> Trainer:
     """A whole training with real parts, so small that its memories wrap and dozens of episodes end in 256 frames.
@@ -113,11 +122,12 @@ def make_training(
         seed: of its networks and worlds.
         learner: changes to the learners' settings.
         options: more arguments of the algorithm.
+        worlds: makes its environments.
         settings: changes to the trainer's settings.
     """
     torch.manual_seed(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    env = small_env(4, seed=seed)
+    env = worlds(4, seed=seed)
     levels = ("exploration",) if name in ("dqn", "drqn") else ("sub_exploration", "meta_exploration")
     parts: dict = {level: EpsilonGreedy(1.0, 0.1, anneal_frames=300) for level in levels}
     quick = {"capacity": 40, "frames_per_update": 8, "warmup_frames": 64, "learning_rate": 1e-2}
@@ -127,7 +137,7 @@ def make_training(
     if len(levels) > 1:
         parts["max_option_steps"] = 3  # several options an episode
     algorithm = build(name, env, settings=tiny_settings(**(quick | (learner or {}))), **parts, **(options or {}))
-    evaluation_env = algorithm.transform(small_env(8))
+    evaluation_env = algorithm.transform(worlds(8))
     defaults = {"total_frames": 256, "log_frames": 96, "evaluation_frames": 128, "checkpoint_frames": 1_000_000}
     settings = defaults | {"checkpoints": Checkpoints(folder / "checkpoints")} | settings
     total_frames = settings["total_frames"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 
 import pytest
-from helpers import check_same, check_same_checkpoint, make_training, seed_everything, table
+from helpers import check_same, check_same_checkpoint, house, make_training, seed_everything, table
 
 from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.runs import checkpoint
@@ -34,6 +34,7 @@ TRAININGS = {
     ),
     "v2-phases": partial(make_training, name="v2", options={"phase_one": PhaseOne(max_frames=64)}),
     "v3": partial(make_training, name="v3"),
+    "v3-three-levels": partial(make_training, name="v3", worlds=house, options={"levels": 3}),
     "v1-r2d2": partial(
         make_training, name="v1", learner={"stored_state": True, "priority_exponent": 0.9, "slice_len": 2}
     ),
@@ -153,7 +154,7 @@ FEW = ("between two updates", "in the middle of options", "with full memories")
 PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
 PAIRS += [(training, cut) for training in ("v2-odd", "v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
 PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of metrics", *FEW[1:])]
-PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole"))]
+PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole", "levels"))]
 PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
 
 
