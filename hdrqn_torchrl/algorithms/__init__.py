@@ -9,11 +9,13 @@ from hdrqn_torchrl.algorithms.flat import make_dqn, make_drqn
 from hdrqn_torchrl.algorithms.hierarchical import make_hdqn, make_hdrqn
 from hdrqn_torchrl.algorithms.levels import Level
 from hdrqn_torchrl.algorithms.v3 import V3_LEARNER, make_v3
+from hdrqn_torchrl.algorithms.views import LevelView
 
 __all__ = [
     "V3_LEARNER",
     "Algorithm",
     "Level",
+    "LevelView",
     "make_dqn",
     "make_drqn",
     "make_hdqn",

@@ -15,6 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
+from hdrqn_torchrl.algorithms.views import LevelView
 from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learning import Learner, LearnerSettings, Monitor
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
@@ -25,13 +26,24 @@ Controller = SubController | MetaController | AllSubgoalsPolicy
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """A policy, its learners (one per level, by name), the transforms its environment needs, and what that states."""
+    """A policy, its learners and all that goes with them.
+
+    Args:
+        policy: chooses at all levels.
+        learners: by name; most algorithms have one per level.
+        explorations: of the levels, by name.
+        make_transforms: makes the transforms that its environment needs.
+        monitors: what is counted besides the learning, by name.
+        levels: where the levels' decisions are read, from level 0 up, for those who watch.
+        task: what the environment states.
+    """
 
     policy: TensorDictModuleBase
     learners: dict[str, Learner]
     explorations: dict[str, EpsilonGreedy]
     make_transforms: Callable[[], Compose]
     monitors: dict[str, Monitor] = field(default_factory=dict)
+    levels: tuple[LevelView, ...] = ()
     task: Task = field(default_factory=Task)
 
     def transform(self, env: EnvBase) -> TransformedEnv:

@@ -10,6 +10,7 @@ from torchrl.envs.transforms import InitTracker
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
+from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.data import StepSelector
 from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, SubController
@@ -76,6 +77,7 @@ def make_drqn(
         learners={"flat": flat},
         explorations={"flat": exploration},
         task=has.task,
+        levels=views_of(has.levels),
         make_transforms=copies_of(InitTracker(), policy.make_tensordict_primer()),
     )
 

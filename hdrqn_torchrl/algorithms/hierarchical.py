@@ -14,6 +14,7 @@ from torchrl.envs.transforms import InitTracker
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
+from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.data import (
     FROM_STARTS,
     HindsightOptions,
@@ -252,6 +253,7 @@ def make_hdrqn(
         explorations={"sub": sub_exploration, "meta": meta_exploration},
         task=has.task,
         make_transforms=copies_of(InitTracker(), subgoals, *primers),
+        levels=views_of(has.levels, masked=masked),
         monitors=phase_monitors(phase_one, num_subgoals, meta_exploration, meta_learner),
     )
 

@@ -23,6 +23,7 @@ from hdrqn_torchrl.algorithms.base import (
 )
 from hdrqn_torchrl.algorithms.books import make_books
 from hdrqn_torchrl.algorithms.requirements import Requirements, check_environment
+from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.data import FROM_STARTS, StepSelector
 from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learning import Learner, LearnerSettings, PhaseOne, phase_monitors
@@ -195,6 +196,7 @@ def make_v3(
         explorations={level.name: each for level, each in zip(has.levels, explorations, strict=True)},
         task=has.task,
         make_transforms=copies_of(InitTracker(), *books, policy.make_tensordict_primer()),
+        levels=views_of(has.levels),
         monitors=phase_monitors(phase_one, has.num_subgoals, meta_exploration, None),
     )
 

@@ -1,4 +1,4 @@
-"""What is counted beside the learning: one protocol, and visits of subgoals as its plainest case."""
+"""What is counted besides the learning: one protocol, and visits of subgoals as its plainest case."""
 
 from __future__ import annotations
 

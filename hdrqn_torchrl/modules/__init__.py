@@ -10,6 +10,7 @@ from hdrqn_torchrl.modules.prediction import CellDecoder, ImageDecoder, Observat
 from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
 from hdrqn_torchrl.modules.repeating import RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.success import SubgoalSuccess, SuccessEpsilonGreedy
+from hdrqn_torchrl.modules.watching import writing_values
 
 __all__ = [
     "AllSubgoalsNetwork",
@@ -35,4 +36,5 @@ __all__ = [
     "compact_network",
     "observation_predictor",
     "paper_network",
+    "writing_values",
 ]

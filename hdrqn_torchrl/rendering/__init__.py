@@ -1,6 +1,6 @@
 """Recorded episodes: what the agent sees, wants and does, as pictures, videos and terminal text."""
 
-from hdrqn_torchrl.rendering.episodes import Decision, Frame, Score, record_episodes
+from hdrqn_torchrl.rendering.episodes import Decision, Frame, Pursuit, Score, record_episodes
 from hdrqn_torchrl.rendering.grid_scene import GridScene
 from hdrqn_torchrl.rendering.levels import BarSpans, bar_spans
 from hdrqn_torchrl.rendering.picture import draw_frame
@@ -14,6 +14,7 @@ __all__ = [
     "Decision",
     "Frame",
     "GridScene",
+    "Pursuit",
     "Scene",
     "Score",
     "ScreenScene",

@@ -1,21 +1,18 @@
-"""Plays episodes and keeps for every step what explains it: world, view, subgoal, rewards, Q-values of both levels."""
+"""Plays episodes and keeps for every step what explains it: world, view, rewards, and the Q-values of every level."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
 from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.modules import EpsilonGreedy
+from hdrqn_torchrl.algorithms import Algorithm, LevelView
+from hdrqn_torchrl.modules import EpsilonGreedy, writing_values
 from hdrqn_torchrl.rendering.scenes import Scene, scene_of
 from hdrqn_torchrl.runs.isolation import isolated
 
@@ -41,16 +38,38 @@ class Decision:
 
 
 @dataclass(frozen=True)
+class Pursuit:
+    """A subgoal in force.
+
+    Attributes:
+        level: name of the level that chose it.
+        names: of the subgoals among which it was chosen.
+        decision: Q-values and choice, from when the option began.
+        steps: how many steps the option has lasted.
+    """
+
+    level: str
+    names: tuple[str, ...]
+    decision: Decision
+    steps: int = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the subgoal."""
+        return self.names[self.decision.choice]
+
+
+@dataclass(frozen=True)
 class Score:
     """What an episode has brought so far.
 
     Attributes:
-        reached: subgoals reached ``[G]``.
-        intrinsic: sum of r^in; ``None`` for flat agents.
+        reached: subgoals reached ``[G]``, of the farthest set.
+        intrinsic: sum of r^in as actions are paid; ``None`` for flat agents.
         steps: steps of the episode.
         total: sum of the task's total reward, the episode's return.
         extrinsic: sum of r^ex.
-        option_steps, option_intrinsic: steps and sum of r^in since the option began.
+        option_intrinsic: sum of r^in since the nearest option began.
     """
 
     reached: tuple[bool, ...]
@@ -58,7 +77,6 @@ class Score:
     steps: int = 0
     total: float = 0.0
     extrinsic: float = 0.0
-    option_steps: int = 0
     option_intrinsic: float = 0.0
 
 
@@ -75,9 +93,8 @@ class Frame:
         episodes: how many are recorded.
         max_steps: step limit of an episode, if there is one.
         score: what came in before this decision.
-        action: Q^S (or Q of a flat agent) and the action.
-        subgoal: Q^M and the subgoal, from when the option began; ``None`` for flat agents.
-        starts_option: whether the subgoal was chosen in this very moment.
+        action: Q-values of actions, and the action.
+        pursuits: subgoals in force, from near to far; none for flat agents.
         event: what the step before did; empty if nothing worth telling.
         outcome: how the episode ended; empty while it is played.
         success: whether it ended with the whole task completed.
@@ -89,11 +106,20 @@ class Frame:
     max_steps: int | None
     score: Score
     action: Decision
-    subgoal: Decision | None
-    starts_option: bool
+    pursuits: tuple[Pursuit, ...] = ()
     event: str = ""
     outcome: str = ""
     success: bool = False
+
+    @property
+    def subgoal(self) -> Decision | None:
+        """Q-values and choice of the farthest subgoal; ``None`` for flat agents."""
+        return self.pursuits[-1].decision if self.pursuits else None
+
+    @property
+    def starts_option(self) -> bool:
+        """Whether a subgoal was chosen in this very moment."""
+        return any(pursuit.steps == 0 for pursuit in self.pursuits)
 
 
 @torch.no_grad()
@@ -107,7 +133,7 @@ def record_episodes(
         algorithm: whose policy plays.
         episodes: number of episodes, at least 1.
         seed: seed of worlds and exploration.
-        epsilon: probability of a random choice, at both levels.
+        epsilon: probability of a random choice, at every level.
 
     Returns:
         One frame for each step and one more for the end of each episode.
@@ -131,47 +157,66 @@ def record_episodes(
         raise ValueError(f"episodes must be >= 1, got {episodes}; 3 show most of what an agent does.")
     if not 0.0 <= epsilon <= 1.0:
         raise ValueError(f"epsilon must lie in [0, 1], got {epsilon}; 0 plays greedily.")
+    if not algorithm.levels:
+        raise ValueError("algorithm must tell its levels to be watched, got none; give it levels=views_of(...).")
     exploration_type = ExplorationType.RANDOM if epsilon > 0 else ExplorationType.DETERMINISTIC
     with (
         isolated(env, algorithm.policy, seed=seed, exploration_type=exploration_type),
         _fixed_epsilon(algorithm.explorations, epsilon),
-        _listening(algorithm.explorations) as heard,
+        writing_values(algorithm.policy),
     ):
-        rounds = (_play(env, algorithm.policy, heard, number + 1, episodes) for number in range(episodes))
+        rounds = (_play(env, algorithm, number + 1, episodes) for number in range(episodes))
         return [frame for played in rounds for frame in played]
 
 
-def _play(env: EnvBase, policy: nn.Module, heard: dict[str, Decision], episode: int, episodes: int) -> Iterator[Frame]:
+def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> Iterator[Frame]:
     """The frames of one episode."""
     base, tensordict = getattr(env, "base_env", env), env.reset()
-    hierarchical = keys.OPTION_INIT in tensordict
-    score = Score((False,) * tensordict[keys.ATTAINED].shape[-1], intrinsic=0.0 if hierarchical else None)
-    subgoal: Decision | None = None
-    starts, event = False, ""
+    own, *above = algorithm.levels
+    score = Score((False,) * tensordict[keys.ATTAINED].shape[-1], intrinsic=None if own.reward_key is None else 0.0)
+    pursuits: tuple[Pursuit, ...] = ()
+    event = ""
     while True:
-        policy(tensordict)
-        if hierarchical and (starts := bool(tensordict[keys.OPTION_INIT])):
-            subgoal, score = heard["meta"], replace(score, option_steps=0, option_intrinsic=0.0)
-        action = heard["sub" if hierarchical else "flat"]
+        algorithm.policy(tensordict)
+        now = tensordict[0]
+        pursuits = _pursue(above, now, pursuits)
+        if pursuits and pursuits[0].steps == 0:
+            score = replace(score, option_intrinsic=0.0)
+        action = _decision(own, now)
         frame = Frame(
-            scene=scene_of(base, subgoal=_choice(subgoal), action=action.choice),
+            scene=scene_of(base, subgoal=_choice(pursuits), action=action.choice),
             episode=episode,
             episodes=episodes,
             max_steps=getattr(base, "max_steps", None),
             score=score,
             action=action,
-            subgoal=subgoal,
-            starts_option=starts,
+            pursuits=pursuits,
             event=event,
         )
         yield frame
         tensordict = env.step(tensordict)
         after = tensordict["next"][0]
-        score, event = _add(score, after), _tell(frame.scene, after)
+        pursuits = tuple(replace(pursuit, steps=pursuit.steps + 1) for pursuit in pursuits)
+        score, event = _add(score, own, after), _tell(frame, above, after)
         if after[keys.DONE]:
-            yield _last(replace(frame, score=score, event=event), base, after)
+            yield _last(replace(frame, score=score, event=event, pursuits=pursuits), base, after)
             return
         tensordict = env.step_mdp(tensordict)
+
+
+def _pursue(above: Sequence[LevelView], now: TensorDictBase, before: Sequence[Pursuit]) -> tuple[Pursuit, ...]:
+    """The subgoals in force, those chosen in this very step ``[]`` included."""
+    return tuple(
+        Pursuit(view.name, view.choice_names, _decision(view, now)) if now[view.init_key] else before[place]
+        for place, view in enumerate(above)
+    )
+
+
+def _decision(view: LevelView, now: TensorDictBase) -> Decision:
+    """What a level chose in one step ``[]``, and by which Q-values."""
+    values = now[view.value_key]
+    allowed = torch.ones_like(values, dtype=torch.bool) if view.mask_key is None else now[view.mask_key]
+    return Decision(tuple(values.tolist()), tuple(allowed.tolist()), int(now[view.choice_key]))
 
 
 def _last(frame: Frame, base: EnvBase, after: TensorDictBase) -> Frame:
@@ -179,42 +224,44 @@ def _last(frame: Frame, base: EnvBase, after: TensorDictBase) -> Frame:
     success = bool(after[keys.SUCCESS])
     return replace(
         frame,
-        scene=scene_of(base, subgoal=_choice(frame.subgoal)),
-        starts_option=False,
+        scene=scene_of(base, subgoal=_choice(frame.pursuits)),
         outcome=frame.scene.outcome(success, bool(after[keys.TERMINATED])),
         success=success,
     )
 
 
-def _choice(decision: Decision | None) -> int | None:
-    return None if decision is None else decision.choice
+def _choice(pursuits: Sequence[Pursuit]) -> int | None:
+    """The farthest subgoal."""
+    return pursuits[-1].decision.choice if pursuits else None
 
 
-def _add(score: Score, after: TensorDictBase) -> Score:
+def _add(score: Score, own: LevelView, after: TensorDictBase) -> Score:
     """The score after one more step (what the environment wrote, ``[]``)."""
     score = replace(
         score,
         steps=score.steps + 1,
         total=score.total + after[keys.REWARD].item(),
         extrinsic=score.extrinsic + after[keys.EXTRINSIC_REWARD].item(),
-        option_steps=score.option_steps + 1,
         reached=tuple(a or b for a, b in zip(score.reached, after[keys.ATTAINED].tolist(), strict=True)),
     )
     if score.intrinsic is None:
         return score
-    reward = after[keys.INTRINSIC_REWARD].item()
+    reward = after[own.reward_key].item()
     return replace(score, intrinsic=score.intrinsic + reward, option_intrinsic=score.option_intrinsic + reward)
 
 
-def _tell(scene: Scene, after: TensorDictBase) -> str:
+def _tell(frame: Frame, above: Sequence[LevelView], after: TensorDictBase) -> str:
     """What a step did, in a few words."""
     told = []
-    for name, attained in zip(scene.subgoal_names, after[keys.ATTAINED].tolist(), strict=True):
+    for name, attained in zip(frame.scene.subgoal_names, after[keys.ATTAINED].tolist(), strict=True):
         if attained:
             told.append(f"{name} reached, rᵉˣ {after[keys.EXTRINSIC_REWARD].item():+.2f}")
     if after[keys.HAZARD]:
-        told.append(scene.hazard)
-    if keys.OPTION_DONE in after and after[keys.OPTION_DONE] and not (after[keys.SUBGOAL_REACHED] | after[keys.DONE]):
+        told.append(frame.scene.hazard)
+    for view, pursuit in zip(above[:-1], frame.pursuits[:-1], strict=True):
+        if after[view.reached_key]:
+            told.append(f"{pursuit.name} reached")
+    if above and after[keys.OPTION_DONE] and not (after[keys.SUBGOAL_REACHED] | after[keys.DONE]):
         told.append("option given up")
     return ", ".join(told)
 
@@ -230,32 +277,3 @@ def _fixed_epsilon(explorations: dict[str, EpsilonGreedy], epsilon: float) -> It
     finally:
         for name, exploration in explorations.items():
             exploration.fixed = kept[name]
-
-
-@contextmanager
-def _listening(explorations: dict[str, EpsilonGreedy]) -> Iterator[dict[str, Decision]]:
-    """The latest decision of every level: whatever the algorithm, each goes through a method of its exploration."""
-    heard: dict[str, Decision] = {}
-    with ExitStack() as stack:
-        for level, exploration in explorations.items():
-            for method in ("forward",):
-                if hasattr(exploration, method):
-                    setattr(exploration, method, _overheard(getattr(exploration, method), heard, level))
-                    stack.callback(delattr, exploration, method)
-        yield heard
-
-
-def _overheard(choose: Callable, heard: dict[str, Decision], level: str) -> Callable:
-    """``choose``, which also notes its Q-values, mask and choice."""
-    signature = inspect.signature(choose)
-
-    def choose_and_note(*args, **kwargs) -> Any:
-        result = choose(*args, **kwargs)
-        given = signature.bind(*args, **kwargs).arguments
-        values, mask = given["values"][0], given.get("mask")
-        allowed = torch.ones_like(values, dtype=torch.bool) if mask is None else mask[0]
-        choice = result[0] if isinstance(result, tuple) else result
-        heard[level] = Decision(tuple(values.tolist()), tuple(allowed.tolist()), int(choice[0]))
-        return result
-
-    return choose_and_note

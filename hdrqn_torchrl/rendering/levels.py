@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import NamedTuple
 
-from hdrqn_torchrl.rendering.episodes import Decision, Frame
+from hdrqn_torchrl.rendering.episodes import Decision, Frame, Pursuit
 from hdrqn_torchrl.rendering.style import Colour
 
 ACTION_COLOUR = (32, 32, 32)
@@ -33,7 +33,8 @@ def bar_spans(frames: Sequence[Frame]) -> BarSpans:
         BarSpans(action=1.0, subgoal=1.0)
     """
     actions = _span(frame.action for frame in frames if not frame.outcome)
-    return BarSpans(actions, _span(frame.subgoal for frame in frames if frame.subgoal and frame.starts_option))
+    farthest = [frame.pursuits[-1] for frame in frames if frame.pursuits]
+    return BarSpans(actions, _span(pursuit.decision for pursuit in farthest if pursuit.steps == 0))
 
 
 def _span(decisions: Iterable[Decision]) -> float:
@@ -60,6 +61,8 @@ class Level:
     colours: Sequence[Colour]
     span: float
     note: str = ""
+    brief: bool = False
+    """Whether one line tells all: the choice, without bars."""
 
     def bar(self, index: int) -> float:
         """Length of a bar in [0, 1]: 1 for the best, 0 for what is worse by ``span`` or more, or excluded."""
@@ -74,16 +77,23 @@ class Level:
 
 
 def levels_of(frame: Frame, spans: BarSpans) -> list[Level]:
-    """What each level decided: the upper one first; flat agents have one only."""
+    """What each level decided, from the farthest subgoals to the action; those between are brief."""
     scene = frame.scene
     symbol, ink = "Q" if frame.subgoal is None else "Qˢ", [ACTION_COLOUR] * len(scene.action_names)
     levels = [Level("does", symbol, frame.action, scene.action_names, ink, spans.action, _chance(frame.action))]
-    if frame.subgoal is not None:
-        since = "just chosen" if frame.starts_option else f"for {_count(frame.score.option_steps, 'step')}"
-        note = " ".join(part for part in (_chance(frame.subgoal), since) if part)
-        names, colours = scene.subgoal_names, scene.subgoal_colours
-        levels.insert(0, Level("wants", "Qᴹ", frame.subgoal, names, colours, spans.subgoal, note))
+    for nearer in frame.pursuits[:-1]:
+        ink = [ACTION_COLOUR] * len(nearer.names)
+        levels.insert(0, Level("by way of", "Q", nearer.decision, nearer.names, ink, 1.0, _note(nearer), brief=True))
+    if frame.pursuits:
+        farthest, names, colours = frame.pursuits[-1], scene.subgoal_names, scene.subgoal_colours
+        levels.insert(0, Level("wants", "Qᴹ", farthest.decision, names, colours, spans.subgoal, _note(farthest)))
     return levels
+
+
+def _note(pursuit: Pursuit) -> str:
+    """Whether chance chose, and how long ago."""
+    since = f"for {_count(pursuit.steps, 'step')}" if pursuit.steps else "just chosen"
+    return " ".join(part for part in (_chance(pursuit.decision), since) if part)
 
 
 def caption(frame: Frame) -> str:
@@ -91,7 +101,7 @@ def caption(frame: Frame) -> str:
     told = [frame.event]
     if frame.outcome:
         told.append(f"{frame.outcome}, return {frame.score.total:.2f}")
-    elif frame.subgoal is not None and frame.starts_option:
+    elif frame.subgoal is not None and frame.pursuits[-1].steps == 0:
         told.append(f"chooses {frame.scene.subgoal_names[frame.subgoal.choice]}")
     return "; ".join(part for part in told if part)
 

@@ -1,4 +1,4 @@
-"""A recorded moment as a picture: the world, and beside it what the agent sees, wants (Q^M) and does (Q^S)."""
+"""A recorded moment as a picture: the world, and next to it what the agent sees, wants (Q^M) and does (Q^S)."""
 
 from __future__ import annotations
 
@@ -74,14 +74,16 @@ def _draw_score(draw: ImageDraw.ImageDraw, frame: Frame, left: int) -> None:
 
 def _draw_levels(draw: ImageDraw.ImageDraw, levels: list[Level]) -> None:
     top, gap = _TOP + _VIEW + 20, 12
-    free = _BOTTOM - top - _TITLE * len(levels) - gap * (len(levels) - 1)
-    row = min(24, free // sum(len(level.names) for level in levels))
+    names = [name for level in levels if not level.brief for name in level.names]
+    row = min(24, (_BOTTOM - top - _TITLE * len(levels) - gap * (len(levels) - 1)) // len(names))
     size = min(14, max(row - 3, 6))
-    start = _LEFT + 12 + max(draw.textlength(name, font(size, bold=True)) for level in levels for name in level.names)
+    start = _LEFT + 12 + max(draw.textlength(name, font(size, bold=True)) for name in names)
     for level in levels:
         _draw_title(draw, level, top)
-        _draw_bars(draw, level, round(start), top + _TITLE, row, size)
-        top += _TITLE + row * len(level.names) + gap
+        if not level.brief:
+            _draw_bars(draw, level, round(start), top + _TITLE, row, size)
+            top += row * len(level.names)
+        top += _TITLE + gap
 
 
 def _draw_title(draw: ImageDraw.ImageDraw, level: Level, top: int) -> None:
@@ -120,7 +122,7 @@ def _draw_caption(draw: ImageDraw.ImageDraw, frame: Frame, levels: list[Level]) 
     """What happened, if anything did; the scale of the bars otherwise."""
     middle, text = (_BOTTOM + HEIGHT) // 2, caption(frame)
     if not frame.outcome:
-        scales = ", ".join(f"{level.span:g} ({level.symbol})" for level in levels)
+        scales = ", ".join(f"{level.span:g} ({level.symbol})" for level in levels if not level.brief)
         scales = f"full bar: the best Q-value; empty bar: worse by {scales} or more"
         draw.text((_MARGIN, middle), text or scales, _INK if text else _FAINT, font(15 if text else 13), anchor="lm")
         return

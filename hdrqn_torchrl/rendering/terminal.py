@@ -30,7 +30,7 @@ def draw_text(frame: Frame, spans: BarSpans = BarSpans()) -> RenderableType:  # 
     bars = Table.grid(padding=(0, 3))
     levels = levels_of(frame, spans)
     bars.add_row(*(_heading(f"{level.verb} {level.names[level.decision.choice]} {level.note}") for level in levels))
-    bars.add_row(*(_bars(level) for level in levels))
+    bars.add_row(*("" if level.brief else _bars(level) for level in levels))
     style = "bold" if frame.outcome else ""
     return Group(_header(frame), "", scenes, "", bars, "", Text(caption(frame) or " ", style))
 

@@ -44,7 +44,7 @@ def episodes_of(frames):
 
 def facts(frame):
     """What can be compared with ``==``."""
-    return frame.score, frame.action, frame.subgoal, frame.event, frame.outcome, frame.scene.state.agent.item()
+    return frame.score, frame.action, frame.pursuits, frame.event, frame.outcome, frame.scene.state.agent.item()
 
 
 def values_in_one_pass(name, policy, steps):
@@ -132,7 +132,7 @@ def test_recording_leaves_the_agent_and_the_global_generator_as_they_were():
     after = agent.policy.state_dict()
     assert all((before[key] == after[key]).all() for key in before)
     assert (generator == torch.get_rng_state()).all()
-    assert not any({"forward", "extend"} & set(vars(exploration)) for exploration in agent.explorations.values())
+    assert not any(getattr(part, "writes_values", False) for part in agent.policy.modules())
 
 
 class TestWalk:
@@ -142,9 +142,9 @@ class TestWalk:
         none, one, both = (False, False), (True, False), (True, True)
         assert [frame.score for frame in walk("v2")] == [
             Score(none, 0.0),
-            Score(none, -1.0, steps=1, total=-1.0, option_steps=1, option_intrinsic=-1.0),
+            Score(none, -1.0, steps=1, total=-1.0, option_intrinsic=-1.0),
             Score(one, 0.0, steps=2, total=0.0, extrinsic=1.0),  # a new option
-            Score(both, 1.0, steps=3, total=1.0, extrinsic=2.0, option_steps=1, option_intrinsic=1.0),
+            Score(both, 1.0, steps=3, total=1.0, extrinsic=2.0, option_intrinsic=1.0),
         ]
         assert [frame.score.intrinsic for frame in walk("drqn")] == [None] * 4
         assert [frame.score.total for frame in walk("drqn")] == [0.0, -1.0, 0.0, 1.0]
@@ -178,7 +178,7 @@ class TestWalk:
     def test_another_goal_than_the_chosen_one_does_not_end_the_option(self):
         frames = walk("v2", wants=SECOND_GOAL)
         assert [frame.subgoal.choice for frame in frames] == [1, 1, 1, 1]
-        assert [frame.score.option_steps for frame in frames] == [0, 1, 2, 3]
+        assert [frame.pursuits[0].steps for frame in frames] == [0, 1, 2, 3]
         assert frames[-1].score.intrinsic == 0.0 and frames[-1].score.extrinsic == 2.0
 
     def test_time_limits(self):

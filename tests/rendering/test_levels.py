@@ -8,6 +8,11 @@ from hdrqn_torchrl.rendering import BarSpans, Decision, bar_spans
 from hdrqn_torchrl.rendering.levels import caption, levels_of
 
 
+def pursuing(frame, decision):
+    """The frame with another decision for its subgoal."""
+    return replace(frame, pursuits=(replace(frame.pursuits[0], decision=decision),))
+
+
 def test_spans_are_round_numbers_just_above_the_median_distance_from_best_to_worst():
     frames = walk("v2")
     # 0.5 - -0.125 and 1.0 - 0.5; a single goal left has no distance
@@ -22,7 +27,7 @@ def test_spans_are_round_numbers_just_above_the_median_distance_from_best_to_wor
 def test_a_long_option_counts_once():
     start, on, *_ = walk("v2")
     options = [replace(start.subgoal, values=(best, 0.0)) for best in (0.4, 0.6)]
-    frames = [replace(start, subgoal=option) for option in options] + [replace(on, subgoal=options[1])] * 5
+    frames = [pursuing(start, option) for option in options] + [pursuing(on, options[1])] * 5
     assert bar_spans(frames).subgoal == pytest.approx(0.5)
 
 
@@ -50,7 +55,7 @@ def test_levels_are_named_and_say_since_when_and_whether_by_chance():
     assert [level.note for level in levels_of(started, BarSpans())] == ["just chosen", ""]
     assert [level.note for level in levels_of(on, BarSpans())] == ["for 1 step", ""]
     assert [level.note for level in levels_of(walk("v2", wants=SECOND_GOAL)[2], BarSpans())] == ["for 2 steps", ""]
-    by_chance = replace(with_values(on, (1.0, 0.0), choice=1), subgoal=replace(on.subgoal, choice=1))
+    by_chance = pursuing(with_values(on, (1.0, 0.0), choice=1), replace(on.subgoal, choice=1))
     assert [level.note for level in levels_of(by_chance, BarSpans())] == ["at random for 1 step", "at random"]
     assert [level.symbol for level in levels_of(on, BarSpans())] == ["Qᴹ", "Qˢ"]
     assert [level.symbol for level in levels_of(walk("drqn")[0], BarSpans())] == ["Q"]

@@ -6,7 +6,7 @@ import pytest
 from walk import FLAT, TWO_LEVELS, make_agent, walk, with_values
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.rendering import BarSpans, bar_spans, draw_frame, record_episodes
+from hdrqn_torchrl.rendering import BarSpans, Decision, bar_spans, draw_frame, record_episodes
 from hdrqn_torchrl.rendering.levels import ACTION_COLOUR
 
 BLUE, GREEN, PALE, EMPTY = (31, 119, 180), (44, 160, 44), (200, 200, 200), (242, 242, 242)
@@ -69,10 +69,10 @@ def test_the_chosen_bar_has_the_colour_of_its_subgoal():
         ({"score": {"intrinsic": 0.5}}, RIGHT_COLUMN),
         ({"score": {"option_intrinsic": 0.5}}, RIGHT_COLUMN),
         ({"score": {"steps": 7}}, np.s_[:40, :400]),
-        ({"score": {"option_steps": 7}}, RIGHT_COLUMN),
+        ({"pursuits": {"steps": 7}}, RIGHT_COLUMN),
         ({"scene": {"subgoal": 1}}, np.s_[40:416]),
         ({"scene": {"action": 0}}, np.s_[40:416]),
-        ({"subgoal": {"choice": 1}}, RIGHT_COLUMN),
+        ({"pursuits": {"decision": Decision((1.0, 0.5), (True, True), 1)}}, RIGHT_COLUMN),
         ({"action": {"choice": 1}}, RIGHT_COLUMN),
         ({"episode": 2}, np.s_[:40, :400]),
         ({"max_steps": None}, np.s_[:40, :400]),
@@ -84,7 +84,10 @@ def test_the_chosen_bar_has_the_colour_of_its_subgoal():
 def test_every_fact_can_be_seen_in_its_place(change, where):
     frame = walk("v2")[1]
     (name, value), *_ = change.items()
-    changed = replace(frame, **{name: replace(getattr(frame, name), **value) if isinstance(value, dict) else value})
+    if isinstance(value, dict):
+        kept = getattr(frame, name)
+        value = (replace(kept[0], **value),) if name == "pursuits" else replace(kept, **value)
+    changed = replace(frame, **{name: value})
     differs = (draw_frame(frame) != draw_frame(changed)).any(-1)
     elsewhere = differs.copy()
     elsewhere[where] = False
