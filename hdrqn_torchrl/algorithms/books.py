@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms.requirements import Requirements
-from hdrqn_torchrl.transforms import SubgoalTransform
+from hdrqn_torchrl.transforms import SubgoalTransform, penalties_of_sets
 
 
 def make_books(
@@ -27,12 +27,11 @@ def make_books(
         has: what the environment has.
         gamma: discount inside options.
         max_option_steps: step limit of the nearest options.
-        hazard_reward, wrong_subgoal_reward: of the critic; the latter for all sets, or for each from near to far.
+        hazard_reward, wrong_subgoal_reward: of the critic; the latter as in
+            :func:`~hdrqn_torchrl.transforms.penalties_of_sets`.
         repeatable: whether subgoals of the farthest set can be attained again; ``None``: as the task states it.
     """
-    penalties = [wrong_subgoal_reward] * len(has.subgoals)
-    if not isinstance(wrong_subgoal_reward, (int, float)):
-        penalties = list(wrong_subgoal_reward)
+    penalties = penalties_of_sets(wrong_subgoal_reward, len(has.subgoals))
     books: list[SubgoalTransform] = []
     above: keys.OptionKeys | None = None
     levels = zip(has.subgoals, has.available_keys, penalties, strict=True)
@@ -47,7 +46,7 @@ def make_books(
                 gamma=gamma,
                 max_option_steps=max_option_steps if index == 0 else None,
                 hazard_reward=hazard_reward,
-                wrong_subgoal_reward=penalty,  # type: ignore[arg-type]
+                wrong_subgoal_reward=penalty,
                 repeatable=subgoals.repeatable if repeatable is None or not is_top else repeatable,
                 available_key=available_key,
                 hazard_key=has.hazard_key,

@@ -110,9 +110,9 @@ def make_v3(
         sub_gamma, meta_gamma, middle_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, bonus_reward,
             prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
         wrong_subgoal_reward: of the levels below the top, for attaining another subgoal than the one in question; one
-            number, or one for each set of subgoals from near to far. Below 0 it keeps the agent from spoiling what
-            comes later (the grid tasks have -0.5); but where one subgoal is needed for another, such as the key for the
-            door, it forbids the only way: docs/v3.md has what was measured.
+            number for the farthest set, or one for each set from near to far. Below 0 it keeps the agent from spoiling
+            what comes later (the grid tasks have -0.5); but where one subgoal is needed for another, such as the key
+            for the door, it forbids the only way: docs/v3.md has what was measured.
         max_option_steps: step limit of an option of the nearest subgoals.
         max_meta_target: largest return of the task there can be; the meta level's targets are cut off above it.
             ``None``: what the task states, if it states one; ``"unbounded"``: they are not cut off.
@@ -154,7 +154,7 @@ def make_v3(
         meta_gamma=meta_gamma,
         middle_gamma=middle_gamma,
         trace_decay=trace_decay,
-        wrong_subgoal_reward=() if flat else wrong_subgoal_reward,
+        wrong_subgoal_reward=wrong_subgoal_reward,
         hazard_reward=0.0 if has.hazard_key is None else hazard_reward,
         bonus_reward=bonus_reward,
         double=learner.double,

@@ -65,8 +65,8 @@ class AllSubgoalsLoss(SequenceLoss):
         trace_decay: lambda.
         reached_reward, hazard_reward: of the levels below the top, for attaining the subgoal, and for meeting the
             hazard (which is not read if that is 0).
-        wrong_subgoal_reward: for attaining another subgoal of the same set; one number, or one for each set from near
-            to far.
+        wrong_subgoal_reward: for attaining another subgoal of the same set; one number for the
+            farthest set, or one for each set from near to far.
         bonus_reward: for an agent of one level, which has no critic: added to the task's reward for each subgoal that a
             step attains (key ``bonus``).
         double: Double Q-learning.

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.objectives.targets import double_q_value, greedy_choice, watkins_trace
-from hdrqn_torchrl.transforms import IntrinsicReward
+from hdrqn_torchrl.transforms import IntrinsicReward, penalties_of_sets
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -228,19 +228,13 @@ def make_rules(
         subgoals: entries of each set of subgoals, from near to far; none: one level.
         sub_gamma, middle_gamma, meta_gamma: discounts of level 0, of those between, and of the top level above it.
         reached_reward, hazard_reward: of the critic.
-        wrong_subgoal_reward: of the critic, for all sets or for each.
+        wrong_subgoal_reward: of the critic (:func:`~hdrqn_torchrl.transforms.penalties_of_sets`).
         largest_return, smallest_return: of the task.
 
     Raises:
         ValueError: if there are not as many penalties as sets.
     """
-    wrong = [wrong_subgoal_reward] * len(subgoals) if isinstance(wrong_subgoal_reward, (int, float)) else None
-    penalties = list(wrong_subgoal_reward) if wrong is None else wrong  # type: ignore[arg-type]
-    if len(penalties) != len(subgoals):
-        raise ValueError(
-            f"wrong_subgoal_reward must be one number, or one for each of {len(subgoals)} sets of subgoals from near "
-            f"to far, got {penalties}; give one number for all."
-        )
+    penalties = penalties_of_sets(wrong_subgoal_reward, len(subgoals))
     rules = []
     for index, (choices, pursues) in enumerate(zip([None, *subgoals], [*subgoals, None], strict=True)):
         gamma = sub_gamma if choices is None else meta_gamma if pursues is None else middle_gamma

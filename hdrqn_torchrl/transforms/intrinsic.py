@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
@@ -73,3 +74,28 @@ class IntrinsicReward:
             (1.0, inf)
         """
         return math.inf if max(self.hazard, self.wrong_subgoal) > 0.0 else max(self.reached, 0.0)
+
+
+def penalties_of_sets(wrong_subgoal_reward: float | Sequence[float], number: int) -> list[float]:
+    """What attaining another subgoal of the same set pays, for each set from near to far.
+
+    Args:
+        wrong_subgoal_reward: one number is for the farthest set, as nearer subgoals are passed on the way to others;
+            or one number for each set.
+        number: of sets.
+
+    Raises:
+        ValueError: if there is one number for each of another number of sets.
+
+    Examples:
+        >>> penalties_of_sets(-0.5, 2)
+        [0.0, -0.5]
+    """
+    if not isinstance(wrong_subgoal_reward, Sequence):
+        return [0.0] * (number - 1) + [wrong_subgoal_reward] * min(number, 1)
+    if len(wrong_subgoal_reward) != number:
+        raise ValueError(
+            f"wrong_subgoal_reward must be one number, or one for each of {number} sets of subgoals from near to far, "
+            f"got {list(wrong_subgoal_reward)}; one number is for the farthest set."
+        )
+    return list(wrong_subgoal_reward)

@@ -46,7 +46,7 @@ def make_loss(levels, **settings):
     names = [OptionKeys(prefix) for prefix in prefixes]
     loss = AllSubgoalsLoss(
         AllSubgoalsPolicy(Tables([SETS[prefix] for prefix in prefixes]), subgoal_keys=names),
-        **(SETTINGS | ({"wrong_subgoal_reward": []} if levels == 1 else {}) | settings),
+        **(SETTINGS | {"wrong_subgoal_reward": [SETTINGS["wrong_subgoal_reward"]] * (levels - 1)} | settings),
     )
     with torch.no_grad():
         for value in loss.target_policy_params.values(True, True):
@@ -246,6 +246,8 @@ def test_names_of_figures():
 def test_each_set_has_its_own_penalty():
     loss, _ = make_loss(4, wrong_subgoal_reward=[0.0, -0.25, -0.5])
     assert [rule.rewards.wrong_subgoal for rule in loss.rules[:-1]] == [0.0, -0.25, -0.5]
+    loss, _ = make_loss(4, wrong_subgoal_reward=-0.25)  # nearer subgoals are passed on the way
+    assert [rule.rewards.wrong_subgoal for rule in loss.rules[:-1]] == [0.0, 0.0, -0.25]
     with pytest.raises(ValueError, match=r"wrong_subgoal_reward must be one number, or one for each of 3 sets"):
         make_loss(4, wrong_subgoal_reward=[0.0])
 
