@@ -92,10 +92,6 @@ class OptionKeys:
         return self.of(SUBGOAL_VALUE)
 
     @property
-    def subgoal_exploration(self) -> str:
-        return self.of(SUBGOAL_EXPLORATION)
-
-    @property
     def exploration(self) -> str:
         return self.of(SUBGOAL_EXPLORATION)
 

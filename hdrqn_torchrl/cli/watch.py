@@ -1,4 +1,4 @@
-"""Records episodes of a trained agent: the world, what the agent sees, wants and does, and both levels' Q-values.
+"""Records episodes of a trained agent: the world, what the agent sees, wants and does, and the Q-values of every level.
 
     python watch.py run=RUN_DIR out=episode.gif
     python watch.py run=RUN_DIR out=terminal env.layout=four_rooms epsilon=0.1
@@ -8,7 +8,7 @@ out              what to write, by ending: .gif or .mp4 (needs PyAV), or termina
 episodes         how many, one after the other (default 3)
 seed             of worlds and exploration; the same seed shows the same episodes (default 0)
 checkpoint       best (default), last, or the path of a checkpoint or weights file
-epsilon          probability of a random choice, at both levels (default 0: greedy)
+epsilon          probability of a random choice, at every level (default 0: greedy)
 fps              steps a second (default 4)
 env.KEY          a setting of the task that shall differ from the run's: env.view, env.obstacle, env.max_steps, ...
 allowed_targets  builders of your own that the run may name: [package.builder]

@@ -18,7 +18,7 @@ class SubgoalSuccess(nn.Module):
 
     Args:
         num_subgoals: G.
-        window: number of options that the average goes over; fewer while there have not been so many.
+        window: number of options that the average goes over, or all of them while there are fewer.
         active_subgoal_key, option_done_key, reached_key: written by
             :class:`~hdrqn_torchrl.transforms.SubgoalTransform`, read below ``"next"``.
 

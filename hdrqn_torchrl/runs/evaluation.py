@@ -174,7 +174,7 @@ def play(
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
         observers: are shown every step and told where it belongs to an episode that counts: environments that are done
             with theirs go on, and short episodes would be seen too often.
-        max_steps: episodes are cut off after so many steps, if they have not ended before; ``None``: not at all.
+        max_steps: steps after which an episode is cut off if it has not ended before; ``None``: none is.
 
     Returns:
         One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)`` and, if ``max_steps`` is

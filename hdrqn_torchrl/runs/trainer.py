@@ -46,7 +46,7 @@ class Trainer:
         checkpoints: where the whole training is saved; ``None``: nowhere.
         checkpoint_frames: frames between checkpoints.
         checkpoint_seconds: seconds after which one is written in any case.
-        ceiling: return of a scripted player, logged beside the greedy one.
+        ceiling: return of a scripted player, logged next to the greedy one.
     """
 
     def __init__(

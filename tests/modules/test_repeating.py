@@ -9,7 +9,7 @@ NETWORK = QNetwork(FullyConnectedFeatures(3, (4,)), num_actions=2, hidden_size=4
 
 
 class TestRepeatingEpsilonGreedy:
-    ACTIONS = 64  # so many that a random one is hardly ever the greedy one, action 0
+    ACTIONS = 64  # enough that a random one is hardly ever the greedy one, action 0
 
     def play(self, exploration, num_envs=1_000, steps=200):
         """Choices and what was carried before each, ``[T, N]`` and ``[T + 1, N, 2]``."""

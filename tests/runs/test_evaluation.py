@@ -312,7 +312,7 @@ def test_observers_see_every_step_and_know_those_of_episodes_that_count():
 
     steps = Steps()
     played = play(pair_env(4), always_right(), episodes=40, observers=[steps])
-    assert steps.seen > steps.counted == played["steps"].sum()  # who was lucky at once went on beside the others
+    assert steps.seen > steps.counted == played["steps"].sum()  # who was lucky at once went on while the others played
 
 
 def test_legs_are_those_of_the_episodes_that_are_reported():
