@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 ROOT = Path(__file__).parent.parent
 os.environ["RL_LOGGING_LEVEL"], os.environ["OMP_NUM_THREADS"] = "WARNING", "1"
@@ -111,7 +113,6 @@ def leftovers(folder: Path) -> int:
 def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None:
     """What train.py does in a run folder, be it empty or left by a killed process, with a training of helpers.py."""
     from helpers import make_training, seed_everything
-    from omegaconf import OmegaConf
 
     from hdrqn_torchrl.cli import train
     from hdrqn_torchrl.cli.resuming import Plan
@@ -145,5 +146,6 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
 
     begin, train.build_run, train.begin = train.begin, build_run, noted_begin
     train.record, train.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
-    train.train(Plan(folder, OmegaConf.create({"threads": 1, "init_from": None}), {}, resumed=True))
+    config: Any = SimpleNamespace(threads=1, init_from=None, allowed_targets=[])
+    train.train(Plan(folder, config, {}, resumed=True))
     diary.note("done")

@@ -20,8 +20,11 @@ from safetensors.torch import load_file, save_file
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.cli import evaluate, plot, report, train
-from hdrqn_torchrl.cli.configuration import RunError, SettingsError, check, read_config
+from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.reading import read_config
+from hdrqn_torchrl.runs.settings import check
 
 BIG = 200 << 30
 

@@ -17,8 +17,9 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from programs import CONF
 
 from hdrqn_torchrl.cli import train
-from hdrqn_torchrl.cli.configuration import RunError, SettingsError
+from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
+from hdrqn_torchrl.runs.arguments import SettingsError
 
 VALUES = (
     "0", "1", "2", "3", "-1", "7", "1000", "0.5", "1.5", "-0.5", "1e3", "inf", "nan", "null", "true", "abc", "''",
@@ -114,8 +115,9 @@ def refused(number, folder, run):
     parts, overrides = draw(number) if isinstance(number, int) else number
     try:
         config = configure(parts, overrides)
-        train.check(config)
-        plan = Plan(folder, config, {}, resumed=False)
+        settings = train.resolved(config)
+        train.check(settings)
+        plan = Plan(folder, settings, {}, resumed=False)
         folder.mkdir()
         with train.in_words(plan):
             run(plan)

@@ -11,7 +11,7 @@ from processes import ROOT
 from programs import TINY_HDRQN
 
 from hdrqn_torchrl.cli import evaluate, plot
-from hdrqn_torchrl.cli.configuration import command_line
+from hdrqn_torchrl.cli.command_line import command_line
 
 TRUSTED = "allowed_targets=[user_envs.Corridor]"
 TASK = [

@@ -33,14 +33,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from omegaconf import MISSING, OmegaConf
+from omegaconf import MISSING
 
-from hdrqn_torchrl.cli.configuration import Agent, SettingsError, check_place, command_line, load_agent
+from hdrqn_torchrl.cli.command_line import check_place, command_line
+from hdrqn_torchrl.runs.arguments import SettingsError
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from hdrqn_torchrl.learning.legs import LegCounter
+    from hdrqn_torchrl.runs import Agent
 
 
 @dataclass
@@ -93,6 +95,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
     from torchrl.envs import ExplorationType
 
     from hdrqn_torchrl.analysis.episodes import summarise
+    from hdrqn_torchrl.runs import load_agent
     from hdrqn_torchrl.runs.evaluation import play
     from hdrqn_torchrl.runs.folder import ceiling_of, references_for
 
@@ -125,7 +128,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
     result = {
         "run": settings.run,
         "checkpoint": settings.checkpoint,
-        "env": OmegaConf.to_container(agent.config.env, resolve=True),
+        "env": agent.config.env,
         "seed": seed,
         "epsilon": settings.epsilon,
         **summarise(played),

@@ -53,7 +53,9 @@ from hdrqn_torchrl.analysis.results import (
     read_run,
     source_of,
 )
-from hdrqn_torchrl.cli.configuration import SettingsError, command_line, read_choices
+from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.reading import read_choices
 from hdrqn_torchrl.runs.stored_settings import read_settings
 
 ALLOWED = {

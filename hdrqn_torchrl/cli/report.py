@@ -36,9 +36,10 @@ from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves
 from hdrqn_torchrl.analysis.figures import plot_legs_over_time
 from hdrqn_torchrl.analysis.grouping import Entry, value_of
 from hdrqn_torchrl.analysis.results import final_value
-from hdrqn_torchrl.cli.configuration import SettingsError, command_line
+from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.cli.plot import as_list, common_references, note, read_entries
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Job, Study, flat, is_run_of, jobs_of
+from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.files import RunFileError, read_json
 
 LARGEST_ARCHIVE = 256 << 20  # bytes, unpacked; a hundred times what all studies take

@@ -8,8 +8,9 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Set
-from dataclasses import dataclass
+from collections.abc import Sequence, Set
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,13 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from hdrqn_torchrl.cli.building import plain
-from hdrqn_torchrl.cli.configuration import SettingsError, check, read_choices, read_config
+from hdrqn_torchrl.cli.configuration import plain
+from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.commands import command_of
+from hdrqn_torchrl.runs.reading import read_choices, read_config
+from hdrqn_torchrl.runs.settings import RunSettings, Settings, as_plain, check, settings_of
 from hdrqn_torchrl.runs.stored_settings import INTERPOLATION
 
 FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets", "evaluation.ceilings")
@@ -33,10 +36,10 @@ FOLLOWS = "learning_rate_frames"
 
 @dataclass(frozen=True)
 class Plan:
-    """What train.py is going to do."""
+    """What a training is going to do."""
 
     folder: Path
-    config: DictConfig
+    config: RunSettings
     choices: dict[str, str]
     resumed: bool
     """Whether it goes on with a run that was begun before."""
@@ -46,11 +49,11 @@ class Plan:
     """What it begins with instead of random weights."""
 
 
-def plan(config: DictConfig, folder: Path) -> Plan:
+def plan(config: RunSettings, folder: Path) -> Plan:
     """Follows ``resume``.
 
     Args:
-        config: settings as Hydra composed them, all references followed (:func:`configuration.resolved`).
+        config: settings of the command line (:func:`~hdrqn_torchrl.cli.configuration.resolved`).
         folder: Hydra's new run folder.
 
     Raises:
@@ -62,8 +65,8 @@ def plan(config: DictConfig, folder: Path) -> Plan:
         refuse_reference(folder)
         if holds_run(folder):
             raise SettingsError(
-                f"{folder} already holds a run, which would be overwritten; `{command(folder, config)}` goes on "
-                "with it, any other hydra.run.dir starts a new one."
+                f"{folder} already holds a run, which would be overwritten; "
+                f"`{command(folder, config.allowed_targets)}` goes on, any other hydra.run.dir begins a new one."
             )
         return Plan(folder, config, choices, resumed=False)
     if config.resume == "auto":
@@ -114,7 +117,7 @@ def refuse_other_algorithm(choices: dict[str, str]) -> None:
                 )
 
 
-def command(folder: Path, config: DictConfig) -> str:
+def command(folder: Path, allowed_targets: Sequence[str] = ()) -> str:
     """What goes on with a run, as it is to be typed: quoted for the shell and for Hydra, with what one must trust."""
     value = str(folder)
     if INTERPOLATION in value:
@@ -124,8 +127,8 @@ def command(folder: Path, config: DictConfig) -> str:
     if not _is_read_as_it_stands(value):
         value = '"' + value.replace('"', '\\"') + '"'
     words = [f"resume={value}"]
-    if targets := list(config.get("allowed_targets") or ()):
-        words.append(f"allowed_targets=[{','.join(map(str, targets))}]")
+    if allowed_targets:
+        words.append(f"allowed_targets=[{','.join(allowed_targets)}]")
     return f"{command_of('train')} {shlex.join(words)}"
 
 
@@ -149,7 +152,7 @@ def split(path: Path) -> tuple[Path, Path | None]:
     return path, None
 
 
-def find_same(config: DictConfig, folder: Path) -> Path | None:
+def find_same(config: RunSettings, folder: Path) -> Path | None:
     """The run that the same command started before: in ``folder``, or else the newest below ``output_root``."""
     if (folder / "config.yaml").exists():
         return folder
@@ -160,16 +163,16 @@ def find_same(config: DictConfig, folder: Path) -> Path | None:
     return max(same, key=lambda run: (run / "config.yaml").stat().st_mtime, default=None)
 
 
-def _differences_or_broken(run: Path, config: DictConfig) -> list[str]:
+def _differences_or_broken(run: Path, config: RunSettings) -> list[str]:
     try:
-        return differences(read_config(run), config)
+        return differences(as_plain(read_config(run)), as_plain(config))
     except SettingsError as error:
         return [str(error)]
 
 
 def with_overrides(
-    stored: DictConfig, stored_choices: dict[str, str], given: DictConfig, overrides: list[str]
-) -> DictConfig:
+    stored: RunSettings, stored_choices: dict[str, str], given: RunSettings, overrides: list[str]
+) -> RunSettings:
     """A run's settings with those changed that were given on the command line.
 
     Args:
@@ -178,20 +181,23 @@ def with_overrides(
         given: what the whole command line composes to.
         overrides: the command line.
     """
-    config = stored.copy()
+    config, composed = OmegaConf.create(as_plain(stored)), OmegaConf.create(as_plain(given))
     for override in overrides:
         key, _, value = override.lstrip("+~").partition("=")
         if stored_choices.get(key) == value:
             continue
         if key in stored_choices and key not in config:
             raise SettingsError(f"{override} can't be given with resume=FOLDER: settings come from that run.")
-        OmegaConf.update(config, key, OmegaConf.select(given, key), merge=False, force_add=True)
+        OmegaConf.update(config, key, OmegaConf.select(composed, key), merge=False, force_add=True)
     if config.total_frames > stored.total_frames:
-        for path in _following(plain(stored)):
+        for path in _following(as_plain(stored)):
             OmegaConf.update(config, path, config.total_frames)
-    config.allowed_targets = given.allowed_targets  # never from the run folder
-    config.resume, config.resume_override = given.resume, given.resume_override
-    return config
+    return replace(
+        settings_of(plain(config)),
+        allowed_targets=given.allowed_targets,  # never from the run folder
+        resume=given.resume,
+        resume_override=given.resume_override,
+    )
 
 
 def _following(settings: dict[str, Any]) -> list[str]:
@@ -200,9 +206,9 @@ def _following(settings: dict[str, Any]) -> list[str]:
     return [key for key, value in _flat(settings["algo"], "algo").items() if key.endswith(FOLLOWS) and value == total]
 
 
-def refuse_differences(run: Path, config: DictConfig) -> None:
+def refuse_differences(run: Path, config: RunSettings) -> None:
     """Ends the program with a list of what changed since ``run`` began, unless ``resume_override`` is set."""
-    found = differences(read_config(run), config)
+    found = differences(as_plain(read_config(run)), as_plain(config))
     if found and not config.resume_override:
         lines = "\n  ".join(found)
         raise SettingsError(
@@ -211,14 +217,14 @@ def refuse_differences(run: Path, config: DictConfig) -> None:
         )
 
 
-def refuse_other_databases(config: DictConfig, known: Set[str]) -> None:
+def refuse_other_databases(config: RunSettings, known: Set[str]) -> None:
     """Ends the program if a run folder names a database or server that the command does not: it would be written to.
 
     Args:
         config: settings of a run that was read back.
         known: those that need no word.
     """
-    for index, logger in enumerate(config.logger.loggers):
+    for index, logger in enumerate(config.logger["loggers"]):
         place = logger.get("tracking_uri")
         if place is not None and place not in {*known, *config.allowed_targets}:
             raise SettingsError(
@@ -236,9 +242,9 @@ def refuse_going_back(checkpoint: Path) -> None:
         )
 
 
-def differences(stored: DictConfig, config: DictConfig) -> list[str]:
+def differences(stored: Settings, config: Settings) -> list[str]:
     """Settings that changed, one line each. Raising ``total_frames`` is none, nor is what follows it."""
-    before, after = (_flat(_without_copies(plain(each))) for each in (stored, config))
+    before, after = (_flat(_without_copies(deepcopy(each))) for each in (stored, config))
     frames = before.pop("total_frames"), after.pop("total_frames")
     changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
     for key in sorted(before.keys() | after.keys()):
@@ -281,7 +287,7 @@ def record(run: Plan) -> None:
             "versions": {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")},
         }
         write_whole(run.folder / "run.json", json.dumps(origin, indent=2) + "\n")
-    write_whole(run.folder / "config.yaml", OmegaConf.to_yaml(run.config))
+    write_whole(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(as_plain(run.config))))
 
 
 def _commit() -> str | None:

@@ -13,8 +13,7 @@ from omegaconf import OmegaConf
 
 from hdrqn_torchrl.analysis.claims import Alike, Claim, Near, Ordered
 from hdrqn_torchrl.analysis.comparison import GREEDY, PAPER, Panel
-from hdrqn_torchrl.cli.building import plain
-from hdrqn_torchrl.cli.configuration import CONF
+from hdrqn_torchrl.cli.configuration import CONF, plain
 from hdrqn_torchrl.cli.resuming import FREE
 
 _IRRELEVANT = (*FREE, "logger", "device", "threads", "log_frames")  # to what is learned

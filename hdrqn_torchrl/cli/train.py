@@ -15,14 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from hdrqn_torchrl.cli import sweeps
-from hdrqn_torchrl.cli.building import build, build_algorithm, build_env, explain, plain
-from hdrqn_torchrl.cli.configuration import CONF, RunError, SettingsError, check, pick_device, resolved
+from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, holds_run, plan, record
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.building import build, build_algorithm, build_env
 from hdrqn_torchrl.runs.files import check_file, remove, replaced, write_whole
+from hdrqn_torchrl.runs.settings import check, pick_device
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -40,13 +41,13 @@ def main(config: DictConfig) -> float:
     os.chdir(HydraConfig.get().runtime.cwd)  # where paths were given: hydra.job.chdir=true would move below them
     sweeps.refuse_if_stopped()
     try:
-        config = resolved(config)
-        check(config)
-        run = plan(config, folder)
+        settings = resolved(config)
+        check(settings)
+        run = plan(settings, folder)
         return train(run)
     except KeyboardInterrupt as stop:
         folder = folder if run is None else run.folder
-        print(f"{str(stop) or 'stopped'}; `{command(folder, config)}` goes on", file=sys.stderr)
+        print(f"{str(stop) or 'stopped'}; `{command(folder, config.allowed_targets)}` goes on", file=sys.stderr)
         sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
     except Exception as error:
         if run is None and not holds_run(folder):
@@ -69,7 +70,7 @@ def train(run: Plan) -> float:
     torch.set_num_threads(run.config.threads)
     patience = sweeps.PATIENCE_SECONDS if sweeps.is_sweep() else 0.0
     with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
-        refused = (InstantiationException, ValueError, CheckpointError) if run.resumed else ()
+        refused = (ValueError, CheckpointError) if run.resumed else ()
         with noting_errors(run, unless=refused):
             trainer, evaluation_env, references = begin(run)
         with noting_errors(run):
@@ -86,12 +87,16 @@ def in_words(run: Plan) -> Iterator[None]:
 
     try:
         yield
-    except (InstantiationException, ValueError) as error:
-        raise SettingsError(explain(error)) from error
+    except SettingsError:
+        raise
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
     except (CheckpointError, NonFiniteError) as error:
         raise RunError(str(error)) from error
     except OSError as error:
-        remedy = f"when that is fixed, `{command(run.folder, run.config)}` goes on from the last checkpoint"
+        remedy = (
+            f"when that is fixed, `{command(run.folder, run.config.allowed_targets)}` goes on from the last checkpoint"
+        )
         raise RunError(f"{error}; {remedy}.") from error
 
 
@@ -194,12 +199,12 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     torch.manual_seed(config.seed)
     allowed = config.allowed_targets
     env, algorithm = build_algorithm(config, {"seed": config.seed, "device": device}, allowed)
-    played = {"num_envs": config.evaluation.num_envs, "device": device, **plain(config.evaluation.env)}
+    played = {"num_envs": config.evaluation.num_envs, "device": device, **config.evaluation.env}
     evaluation_base = build_env(config, played, allowed)
     if found := interface_differences(env, evaluation_base):
         raise ValueError(
             f"evaluation.env must leave what the agent sees and does as it is in training, got "
-            f"{OmegaConf.to_container(config.evaluation.env)}: {found}; set env.KEY for both."
+            f"{config.evaluation.env}: {found}; set env.KEY for both."
         )
     evaluation_env = algorithm.transform(evaluation_base)
     references = (
@@ -222,7 +227,7 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
             total_frames=config.total_frames,
             loggers=[
                 build(logger, run.folder, place=f"logger.loggers[{index}]", allowed=allowed)
-                for index, logger in enumerate(config.logger.loggers)
+                for index, logger in enumerate(config.logger["loggers"])
             ],
             label=run.folder.name if sweeps.is_sweep() else "",
         ),

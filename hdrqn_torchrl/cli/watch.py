@@ -24,7 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import MISSING
 
-from hdrqn_torchrl.cli.configuration import SettingsError, check_place, command_line, load_agent
+from hdrqn_torchrl.cli.command_line import check_place, command_line
+from hdrqn_torchrl.runs.arguments import SettingsError
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.rendering import Frame
@@ -73,6 +74,7 @@ def run(settings: Settings) -> None:
 def record(settings: Settings) -> list[Frame]:
     """What the run's agent does."""
     from hdrqn_torchrl.rendering import record_episodes
+    from hdrqn_torchrl.runs import load_agent
 
     agent = load_agent(
         settings.run,

@@ -8,61 +8,25 @@ loaded; the last few and the best are kept; removal of what killed writes left b
 
 from __future__ import annotations
 
-import json
 import math
-import os
-import shutil
 import sys
 import warnings
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
 from torchrl.checkpoint import Checkpoint, CheckpointError, GlobalRNGState
 
-from hdrqn_torchrl.runs.files import (
-    RunFileError,
-    check_file,
-    check_folder,
-    is_hollow,
-    memory_of_this_machine,
-    read_json,
-)
-from hdrqn_torchrl.runs.serialization import SafetensorsAdapter, check_tensors
+from hdrqn_torchrl.runs.durable import MANIFEST, MEMORY, DurableCheckpoint, forget_memories, remove_all, verify
+from hdrqn_torchrl.runs.files import RunFileError, check_folder, read_json
 from hdrqn_torchrl.runs.state_checks import Rule
 
-CHECKSUMS = "checksums.json"
-PREFIX, SCORE, MEMORY = "checkpoint-", "greedy_return", "memory-"
+PREFIX, SCORE = "checkpoint-", "greedy_return"
 _LONGEST_REASON = 400
 Replay = bool | Literal["last"]
 _UNSCORED = -sys.float_info.max  # the rotation wants a finite number; this one is never the best
-
-
-class DurableCheckpoint(Checkpoint):
-    """TorchRL's ``Checkpoint`` with checksums, written to the disk before it gets its name.
-
-    Args:
-        components: objects with ``state_dict`` and ``load_state_dict``, by name.
-        rules: see :class:`~hdrqn_torchrl.runs.serialization.SafetensorsAdapter`.
-    """
-
-    def __init__(self, components: Mapping[str, Any], rules: Mapping[str, Rule] | None = None) -> None:
-        super().__init__()
-        for name, component in components.items():
-            holds_steps = name.startswith(("collector", "learner-", MEMORY))  # others have sums under the same names
-            self.register(name, component, adapter=SafetensorsAdapter(rules if holds_steps else None))
-
-    @staticmethod
-    def _publish_path(source: Path, destination: Path) -> None:
-        files = sorted(path for path in source.rglob("*") if path.is_file())
-        _seal(source, {path.relative_to(source).as_posix(): _checksum(path) for path in files})
-        Checkpoint._publish_path(source, destination)
-        _sync(destination.parent)
 
 
 class RandomState(GlobalRNGState):
@@ -132,7 +96,7 @@ class Checkpoints:
             self._prune()
             for earlier in self._paths():
                 if self.replay == "last" and earlier != path:
-                    _forget_memories(earlier)
+                    forget_memories(earlier)
             return path
         except (OSError, SafetensorError, RunFileError) as error:
             raise CheckpointError(
@@ -160,7 +124,7 @@ class Checkpoints:
             max(scores, key=lambda path: (scores[path], _step(path)), default=None),
         }
         for path in scores.keys() - kept:
-            _remove(path.rename(path.with_name(f".{path.name}.delete")))
+            remove_all(path.rename(path.with_name(f".{path.name}.delete")))
 
     def load(
         self,
@@ -221,7 +185,7 @@ class Checkpoints:
         kept = {path for path in self._whole() if _step(path) <= step}
         for path in self._paths():
             if path not in kept:
-                _remove(path.rename(path.with_name(f".{path.name}.delete")))
+                remove_all(path.rename(path.with_name(f".{path.name}.delete")))
 
     def _paths(self) -> list[Path]:
         """Folders named like checkpoints, the newest first."""
@@ -251,48 +215,13 @@ class Checkpoints:
             if kind.startswith("backup-") and not (self.directory / name).exists():
                 orphan.rename(self.directory / name)  # killed between the two renames of a replacement
             else:
-                _remove(orphan)
-
-
-def _forget_memories(path: Path) -> None:
-    """Replaces a checkpoint by one without its memories; a kill leaves what :meth:`Checkpoints.clean_up` mends."""
-    try:
-        manifest, sums = Checkpoint.manifest(path), read_json(path / CHECKSUMS)
-        memories = [name for name in manifest["components"] if name.startswith(MEMORY)]
-        places = [manifest["components"].pop(name)["path"] for name in memories]
-    except (CheckpointError, ValueError, TypeError, KeyError, AttributeError):
-        return  # it is damaged, and stays as it is
-    if not places:
-        return
-    stage, backup = (path.with_name(f".{path.name}.{kind}-0") for kind in ("stage", "backup"))
-    shutil.copytree(path, stage, symlinks=True, ignore=shutil.ignore_patterns(*(Path(place).name for place in places)))
-    (stage / "manifest.json").write_text(json.dumps(manifest))
-    kept = {name: each for name, each in sums.items() if not name.startswith(tuple(f"{place}/" for place in places))}
-    _seal(stage, kept | {"manifest.json": _checksum(stage / "manifest.json")})  # of the others as they were written
-    path.rename(backup)
-    stage.rename(path)
-    _sync(path.parent)
-    _remove(backup)
-
-
-def _seal(stage: Path, sums: Mapping[str, list[int]]) -> None:
-    """Adds the checksums, and writes everything to the disk."""
-    (stage / CHECKSUMS).write_text(json.dumps(sums))
-    for path in (stage, *stage.rglob("*")):
-        _sync(path)
+                remove_all(orphan)
 
 
 def _in_a_line(error: Exception) -> str:
     """What was wrong first; torch lists every tensor, and shows whole memories."""
     text = " ".join(str(error).split())
     return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
 
 
 def _step(path: Path) -> int:
@@ -304,138 +233,8 @@ def _step(path: Path) -> int:
 def _score(path: Path) -> float | None:
     """What a checkpoint scored, the least there is if it was not measured; ``None`` if it can't be read."""
     try:
-        metadata = read_json(path / "manifest.json", root=path)["metadata"]
+        metadata = read_json(path / MANIFEST, root=path)["metadata"]
         score = metadata.get(SCORE) if isinstance(metadata, dict) else None
         return score if isinstance(score, float) and math.isfinite(score) else _UNSCORED
     except (OSError, ValueError, TypeError, KeyError):
         return None
-
-
-def verify(path: Path) -> None:
-    """Checks that a checkpoint is complete and unchanged since it was written.
-
-    Raises:
-        CheckpointError: if it is not, naming the file at fault.
-    """
-    try:
-        sums = read_json(path / CHECKSUMS, root=path)
-        if not isinstance(sums, dict) or "manifest.json" not in sums:
-            raise ValueError("it lists no files")
-    except (OSError, ValueError) as error:
-        raise CheckpointError(f"{path} is not a checkpoint of this package ({CHECKSUMS}: {error}).") from error
-    _check_files(path, sums)
-    for name, expected in sums.items():
-        if _checksum(path / name) != expected:
-            raise CheckpointError(f"{path} is damaged: {name} is not what was written.")
-    try:
-        read_json(path / "manifest.json", root=path)  # whether TorchRL may
-        records = Checkpoint.manifest(path)["components"].values()
-    except (CheckpointError, OSError, ValueError, TypeError, AttributeError) as error:
-        raise CheckpointError(f"{path} is not a checkpoint of this package (manifest.json: {error}).") from error
-    for record in records:
-        if not {f"{record['path']}/{name}" for name in record["files"]} <= set(sums):
-            raise CheckpointError(f"{path} is not complete: {CHECKSUMS} lacks files of {record['path']}.")
-
-
-def _check_files(path: Path, sums: Mapping[str, Any]) -> None:
-    """What can be told without reading much, before much is read: places, kinds and sizes."""
-    total = 0
-    for name, expected in sums.items():
-        file = path / name
-        try:
-            if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(path)):
-                raise RunFileError(f"{name} lies outside of it")
-            check_file(file, root=path)
-        except RunFileError as error:
-            raise CheckpointError(f"{path} is not a checkpoint of this package: {error}.") from error
-        if not file.is_file():
-            raise CheckpointError(f"{path} is not complete: {name} is missing.")
-        size = file.stat().st_size
-        if not isinstance(expected, list) or expected[:1] != [size]:
-            raise CheckpointError(f"{path} is damaged: {name} is not what was written.")
-        total += size
-        if is_hollow(file) or total > memory_of_this_machine():
-            raise CheckpointError(
-                f"{path} is damaged: {name} holds less than its {size:,} bytes, or more than memory does."
-            )
-
-
-def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
-    """Loads a policy's weights from a run.
-
-    Args:
-        policy: built with the settings of the run.
-        directory: the run's folder of checkpoints.
-        which: ``"best"``, ``"last"``, or the path of a checkpoint or of a file of :func:`save_weights`.
-
-    Raises:
-        ValueError: if there is none, it is damaged, or it does not fit.
-    """
-    checkpoints = Checkpoints(directory)
-    try:
-        path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
-        if path is None:
-            raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
-        if path.is_file():
-            load_weights(policy, path)
-        else:
-            checkpoints.load({"policy": policy}, path)
-    except CheckpointError as error:
-        raise ValueError(f"checkpoint can't be loaded: {error}") from error
-
-
-def save_weights(module: nn.Module, path: Path) -> None:
-    """Writes a module's parameters and buffers to ``path``, which is either the whole file or the one before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    save_file({name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}, partial)
-    _sync(partial)
-    partial.replace(path)
-    _sync(path.parent)
-
-
-def load_weights(module: nn.Module, path: Path) -> None:
-    """Reads what :func:`save_weights` wrote into ``module``.
-
-    Raises:
-        ValueError: if there is no such file, it is of another kind, or it does not fit the module.
-    """
-    try:
-        module.load_state_dict(read_weights(path))
-    except RuntimeError as error:
-        raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
-
-
-def read_weights(path: Path) -> dict[str, Tensor]:
-    """What :func:`save_weights` wrote, by name.
-
-    Raises:
-        ValueError: if there is no such file, or it is of another kind.
-    """
-    if not path.is_file():
-        raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
-    try:
-        check_tensors(path)
-        return load_file(path)
-    except (SafetensorError, ValueError) as error:
-        raise ValueError(
-            f"{path} must be a safetensors file, got something else ({error}); see checkpoints/."
-        ) from error
-
-
-def _checksum(path: Path) -> list[int]:
-    """Size and CRC-32 of a file."""
-    value = 0
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            value = zlib.crc32(block, value)
-    return [path.stat().st_size, value]
-
-
-def _sync(path: Path) -> None:
-    """Waits until a file or the entries of a folder are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

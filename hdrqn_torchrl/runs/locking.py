@@ -111,8 +111,8 @@ def _create(path: Path) -> Callable[[], None]:
     """Creates the file that says that this process is in."""
     for _ in range(2):
         try:
-            descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-        except FileExistsError:
+            descriptor = open_descriptor(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
+        except (FileExistsError, RunFileError):  # somebody is in, or something else lies there
             owner = _read(path)
             if owner is None or not _has_died(owner):
                 remedy = f"if no such process is there any more, remove {path}"

@@ -10,7 +10,8 @@ from torch import Tensor
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.runs.checkpoint import Checkpoints, read_weights
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.weights import read_weights
 
 Weights = dict[str, Tensor]
 _SHOWN = 3  # weights that a message names
@@ -20,7 +21,7 @@ def find_weights(place: Path, which: str = "best") -> Path:
     """Where the weights lie that a user means.
 
     Args:
-        place: a run folder, a checkpoint, or a file of :func:`~hdrqn_torchrl.runs.checkpoint.save_weights`.
+        place: a run folder, a checkpoint, or a file of :func:`~hdrqn_torchrl.runs.weights.save_weights`.
         which: ``"best"`` or ``"last"`` of a run folder's checkpoints.
 
     Returns:

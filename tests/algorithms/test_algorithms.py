@@ -12,7 +12,6 @@ from user_envs import Corridor
 
 from hdrqn_torchrl.algorithms import V3_LEARNER, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.cli import configuration
-from hdrqn_torchrl.cli.building import build_algorithm
 from hdrqn_torchrl.data import FROM_STARTS, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.envs import MultiGoalGridEnv, Task
 from hdrqn_torchrl.modules import (
@@ -22,6 +21,7 @@ from hdrqn_torchrl.modules import (
     compact_network,
     paper_network,
 )
+from hdrqn_torchrl.runs.building import build_algorithm
 
 NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
 
@@ -817,6 +817,6 @@ def test_bounds_of_targets_in_the_settings_that_come_with_the_project():
         for experiment in (None, "as_in_paper"):
             chosen = [] if experiment is None else [f"experiment={experiment}"]
             config = compose("config", overrides=["algo=v2", "env.num_envs=2", "env.num_goals=3", *chosen])
-            learners = build_algorithm(config)[1].learners
+            learners = build_algorithm(configuration.resolved(config))[1].learners
             found[experiment] = [learners[level].loss.max_target for level in ("sub", "meta")]
     assert found == {None: [1.0, 3.0], "as_in_paper": [math.inf, math.inf]}

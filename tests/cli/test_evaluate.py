@@ -10,7 +10,7 @@ from processes import ROOT
 from programs import TINY, TINY_HDRQN
 
 from hdrqn_torchrl.cli import evaluate
-from hdrqn_torchrl.cli.configuration import command_line
+from hdrqn_torchrl.cli.command_line import command_line
 
 
 @pytest.fixture(scope="module")

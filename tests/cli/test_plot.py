@@ -9,7 +9,7 @@ import pytest
 from processes import ROOT
 
 from hdrqn_torchrl.cli import plot
-from hdrqn_torchrl.cli.configuration import command_line
+from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.runs import files
 
 CONFIG = """\

@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from hdrqn_torchrl.analysis.claims import Near
 from hdrqn_torchrl.cli import report
-from hdrqn_torchrl.cli.configuration import command_line
+from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.cli.studies import CONF, STUDIES, Job, flat, is_run_of, jobs_of
 
 COLUMNS = (

@@ -12,11 +12,13 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
-from test_configuration import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
+from run_folders import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
 
 from hdrqn_torchrl.cli import resuming
-from hdrqn_torchrl.cli.configuration import SettingsError, check, resolved
+from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, holds_run, plan, record, split
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings import as_plain, check
 
 
 @cache
@@ -80,20 +82,19 @@ class TestANewRun:
         ["run", "a b", "a#b", "a=b,c", "(a) [b]", "jörg's", 'a"b', "~a", "@a%b", "null", "true", "1e3", "007"],
     )
     def test_the_command_that_goes_on_can_be_typed_as_it_is_printed(self, name):
-        config = OmegaConf.create({"allowed_targets": ["mine.Env", "mine.network"]})
-        words = shlex.split(command(Path(name), config))
+        words = shlex.split(command(Path(name), ["mine.Env", "mine.network"]))
         resume, allowed = OverridesParser.create().parse_overrides(words[2:])
         assert words[:2] == ["python", "train.py"]
         assert str(resume.value()) == name and allowed.value() == ["mine.Env", "mine.network"]
 
     def test_a_folder_called_auto_is_not_taken_for_the_newest_run(self):
-        assert command(Path("auto"), OmegaConf.create({})) == "python train.py resume=./auto"
+        assert command(Path("auto")) == "python train.py resume=./auto"
 
     def test_a_folder_that_would_be_a_reference_is_named_from_here(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "${here}").mkdir()
         monkeypatch.chdir(tmp_path / "${here}")
-        assert command(Path.cwd() / "out", OmegaConf.create({})) == "python train.py resume=out"
+        assert command(Path.cwd() / "out") == "python train.py resume=out"
 
     def test_or_refused_if_it_is_one_from_here_too(self):
         with pytest.raises(
@@ -109,7 +110,7 @@ class TestANewRun:
         assert plan_for("variant=v2_lambda", "algo=v2").choices["algo"] == "v2"
 
     def test_the_command_that_goes_on_names_no_builders_where_none_were_added(self):
-        assert command(Path("out/run"), OmegaConf.create({})) == "python train.py resume=out/run"
+        assert command(Path("out/run")) == "python train.py resume=out/run"
 
     def test_any_other_file_there_is_no_run(self):
         Path("used").mkdir()
@@ -122,7 +123,7 @@ class TestResumingAFolder:
         run = make_run("outputs/a/1", "seed=7", "algo.gamma=0.9", "algo=v1", "env=four_rooms")
         found = plan_for(f"resume={run}")
         assert (found.folder, found.resumed, found.checkpoint) == (run, True, None)
-        assert (found.config.seed, found.config.algo.gamma, found.config.env.layout) == (7, 0.9, "four_rooms")
+        assert (found.config.seed, found.config.algo["gamma"], found.config.env["layout"]) == (7, 0.9, "four_rooms")
         assert (found.choices["algo"], found.choices["env"]) == ("v1", "four_rooms")
         check(found.config)
 
@@ -138,7 +139,7 @@ class TestResumingAFolder:
     def test_total_frames_may_be_raised_and_what_follows_them_follows(self):
         run = make_run("outputs/a/1", "total_frames=1000")
         found = plan_for(f"resume={run}", "total_frames=3000")
-        assert found.config.total_frames == 3000 == found.config.algo.sub.learning_rate_frames
+        assert found.config.total_frames == 3000 == found.config.algo["sub"]["learning_rate_frames"]
 
     def test_but_not_lowered(self):
         run = make_run("outputs/a/1", "total_frames=1000")
@@ -161,8 +162,8 @@ class TestResumingAFolder:
     def test_unless_they_are_taken_on_purpose(self):
         run = make_run("outputs/a/1", "seed=1")
         found = plan_for(f"resume={run}", "seed=2", "algo.sub.tau=0.5", "resume_override=true", "total_frames=5")
-        assert (found.config.seed, found.config.algo.sub.tau, found.config.total_frames) == (2, 0.5, 5)
-        assert found.config.env.view == 3  # of the run, not of conf/
+        assert (found.config.seed, found.config.algo["sub"]["tau"], found.config.total_frames) == (2, 0.5, 5)
+        assert found.config.env["view"] == 3  # of the run, not of conf/
 
     @pytest.mark.parametrize(
         "override", ["checkpoint.interval_frames=7", "checkpoint.keep_last=5", "output_root=other"]
@@ -170,11 +171,13 @@ class TestResumingAFolder:
     def test_what_does_not_change_the_training_is_free(self, override):
         run = make_run("outputs/a/1")
         key, _, value = override.partition("=")
-        assert str(OmegaConf.select(plan_for(f"resume={run}", override).config, key)) == value
+        assert (
+            str(OmegaConf.select(OmegaConf.create(as_plain(plan_for(f"resume={run}", override).config)), key)) == value
+        )
 
     def test_the_same_group_may_be_named_again_and_keeps_the_runs_changes_to_it(self):
         run = make_run("outputs/a/1", "algo=v1", "algo.sub.tau=0.5")
-        assert plan_for(f"resume={run}", "algo=v1").config.algo.sub.tau == 0.5
+        assert plan_for(f"resume={run}", "algo=v1").config.algo["sub"]["tau"] == 0.5
 
     def test_another_one_is_refused(self):
         run = make_run("outputs/a/1", "algo=v1")
@@ -322,7 +325,7 @@ class TestHostileRunFolders:
 class TestDifferences:
     def compare(self, before, after):
         base = {"total_frames": 10, "resume": None, "algo": {"gamma": 0.9}}
-        return differences(*(OmegaConf.create(base | changes) for changes in (before, after)))
+        return differences(*(base | changes for changes in (before, after)))
 
     @pytest.mark.parametrize(
         ("before", "after", "found"),

@@ -24,7 +24,7 @@ from safetensors.torch import load_file
 
 from hdrqn_torchrl.cli import train
 from hdrqn_torchrl.learning import Learner
-from hdrqn_torchrl.runs.checkpoint import verify
+from hdrqn_torchrl.runs.durable import verify
 from hdrqn_torchrl.runs.folder import locked
 from hdrqn_torchrl.runs.logging import CSVLog
 

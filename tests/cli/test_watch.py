@@ -13,9 +13,11 @@ from PIL import Image
 from processes import ROOT
 
 from hdrqn_torchrl.cli import watch
-from hdrqn_torchrl.cli.configuration import build_algorithm
+from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.rendering import record_episodes, video
-from hdrqn_torchrl.runs.checkpoint import Checkpoints, save_weights
+from hdrqn_torchrl.runs.building import build_algorithm
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.weights import save_weights
 
 SMALL = ["env.max_steps=4", "network.hidden_size=8", "network.widths=[8]"]
 
@@ -29,7 +31,9 @@ def make_run(folder, algo="v2"):
     checkpoints = Checkpoints(folder / "checkpoints")
     for step, score in ((1, 1.0), (2, 0.5)):
         torch.manual_seed(step)
-        checkpoints.save({"policy": build_algorithm(config, {"num_envs": 1})[1].policy}, step=step, score=score)
+        checkpoints.save(
+            {"policy": build_algorithm(resolved(config), {"num_envs": 1})[1].policy}, step=step, score=score
+        )
     return folder
 
 
@@ -90,7 +94,7 @@ def test_settings_change_what_is_played(run, command, monkeypatch):
 def test_frames_are_those_of_the_loaded_weights(run, tmp_path, command, monkeypatch):
     """Against an agent built and loaded here."""
     config = OmegaConf.load(run / "config.yaml")
-    env, algorithm = build_algorithm(config, {"num_envs": 1})
+    env, algorithm = build_algorithm(resolved(config), {"num_envs": 1})
     torch.manual_seed(3)
     for parameter in algorithm.policy.parameters():
         torch.nn.init.normal_(parameter)

@@ -13,7 +13,9 @@ from helpers import State, build, make_training, small_env
 from torch import nn
 from torchrl.checkpoint import Checkpoint, CheckpointError
 
-from hdrqn_torchrl.runs.checkpoint import Checkpoints, load_policy, load_weights, save_weights, verify
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.durable import verify
+from hdrqn_torchrl.runs.weights import load_policy, load_weights, save_weights
 
 
 def test_a_policy_comes_back_with_its_weights_and_schedules(tmp_path):
@@ -244,9 +246,9 @@ class TestMemories:
 
             return call_or_die
 
-        monkeypatch.setattr("hdrqn_torchrl.runs.checkpoint.shutil.copytree", dying(shutil.copytree))
+        monkeypatch.setattr("hdrqn_torchrl.runs.durable.shutil.copytree", dying(shutil.copytree))
         monkeypatch.setattr(Path, "rename", dying(Path.rename))
-        monkeypatch.setattr("hdrqn_torchrl.runs.checkpoint._remove", dying(shutil.rmtree))
+        monkeypatch.setattr("hdrqn_torchrl.runs.durable.remove_all", dying(shutil.rmtree))
         with pytest.raises(KeyboardInterrupt):
             self.save(tmp_path, "last", steps=(20,))
         monkeypatch.undo()

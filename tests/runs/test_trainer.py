@@ -8,9 +8,10 @@ from torch import nn
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.runs import trainer as trainer_module
-from hdrqn_torchrl.runs.checkpoint import Checkpoints, load_policy
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.interruption import Interrupted
 from hdrqn_torchrl.runs.trainer import Trainer, crossed
+from hdrqn_torchrl.runs.weights import load_policy
 
 
 @pytest.mark.parametrize(

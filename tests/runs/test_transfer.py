@@ -5,8 +5,8 @@ import pytest
 import torch
 from helpers import build, collect, compact_network, make_training, small_env
 
-from hdrqn_torchrl.runs.checkpoint import save_weights
 from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
+from hdrqn_torchrl.runs.weights import save_weights
 
 ALGORITHMS = ("dqn", "drqn", "hdqn", "v1", "v2", "v3")
 

@@ -14,21 +14,26 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 from hdrqn_torchrl.runs.commands import command_of
 
 TARGET = "_target_"
+Settings = dict[str, Any]
 _IN_WORDS: dict[Any, str] = {
     type(None): "null", bool: "true or false", int: "an integer", float: "a finite number", str: "a text",
 }  # fmt: skip
+
+
+class SettingsError(ValueError):
+    """A setting that breaks its rule, found before any work is done."""
 
 
 def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
     """Checks the types of all settings below ``path``.
 
     Args:
-        node: settings with a ``_target_``, plain or OmegaConf's; those below it may have targets, too.
+        node: settings with a ``_target_``, plain data; those below it may have targets, too.
         path: their full name, for the message.
         locate: finds what a ``_target_`` names.
 
     Raises:
-        ValueError: with the full name of the first setting of another type than its builder's annotations ask for.
+        SettingsError: with the full name of the first setting of another type than its builder's annotations ask for.
 
     Examples:
         >>> from hdrqn_torchrl.modules import EpsilonGreedy
@@ -36,17 +41,17 @@ def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
         >>> check_arguments({"_target_": "epsilon", "start": "high"}, "exploration", lambda _: EpsilonGreedy)
         Traceback (most recent call last):
         ...
-        ValueError: exploration.start must be a finite number, got 'high'; `...` shows every setting and its default.
+        hdrqn_torchrl.runs.arguments.SettingsError: exploration.start must be a finite number, got 'high'; ...
     """
     if not isinstance(node, Mapping) or not isinstance(node.get(TARGET), str):
-        raise ValueError(f"{path} must be settings with a {TARGET}, got {shown(node)}; {remedy()}.")
+        raise SettingsError(f"{path} must be settings with a {TARGET}, got {shown(node)}; {remedy()}.")
     hints = annotations_of(locate(node[TARGET]))
     for name, value in _settings(node):
         full = f"{path}.{name}"
         if isinstance(value, Mapping) and TARGET in value:
             check_arguments(value, full, locate)
         elif name in hints and not fits(value, hints[name]):
-            raise ValueError(f"{full} must be {in_words(hints[name])}, got {shown(value)}; {remedy()}.")
+            raise SettingsError(f"{full} must be {in_words(hints[name])}, got {shown(value)}; {remedy()}.")
 
 
 def remedy() -> str:
@@ -88,7 +93,7 @@ def fits(value: Any, hint: Any) -> bool:
     if hint in (bool, str):
         return isinstance(value, hint)
     kind = origin or hint
-    if not inspect.isclass(kind) or kind is object:
+    if not inspect.isclass(kind) or kind in (object, Any):
         return True  # Any and the like
     if issubclass(kind, Mapping):
         return isinstance(value, Mapping)

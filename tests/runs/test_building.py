@@ -2,7 +2,9 @@
 
 import pytest
 
-from hdrqn_torchrl.cli.building import BUILDERS, SettingsError, build, check_sizes
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.building import build
+from hdrqn_torchrl.runs.trust import BUILDERS, check_sizes
 
 GRID = {"_target_": "hdrqn_torchrl.envs.MultiGoalGridEnv"}
 LEARNER = {"_target_": "hdrqn_torchrl.learning.LearnerSettings"}
@@ -54,3 +56,43 @@ def test_nothing_is_built_without_a_name(settings):
 
 def test_an_environment():
     assert build(GRID | {"num_envs": 3, "view": None}, place="env").num_envs == 3
+
+
+class TestMessages:
+    def test_a_broken_rule_has_the_full_name_of_the_setting_in_front(self):
+        with pytest.raises(SettingsError, match=r"^env\.view must be an odd number .* got 4; "):
+            build(GRID | {"view": 4}, place="env")
+
+    def test_of_a_part_too(self):
+        from helpers import compact_network, small_env
+
+        settings = V2 | {"sub": LEARNER | {"batch_size": 0}}
+        with pytest.raises(SettingsError, match=r"^algo\.sub\.batch_size must be >= 1, got 0; "):
+            build(settings, small_env(2), compact_network(), place="algo")
+
+    def test_an_unknown_setting_is_told_with_what_shows_the_known_ones(self):
+        with pytest.raises(SettingsError, match=r"^env: .*'veiw'; `python train\.py --cfg job` "):
+            build(GRID | {"veiw": 4}, place="env")
+
+    def test_what_the_machine_can_not_do_is_no_wrong_setting(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        settings = {"_target_": "os.makedirs", "name": str(tmp_path / "file" / "folder")}
+        with pytest.raises(SettingsError, match=r"^\[Errno \d+\] Not a directory: "):
+            build(settings, place="env", allowed=["os.makedirs"])
+
+    @pytest.mark.parametrize("target", ["no_such_package.Env", "hdrqn_torchrl.envs.NoSuchEnv", "hdrqn_torchrl.envs"])
+    def test_a_target_that_is_nothing_to_call(self, target):
+        with pytest.raises(SettingsError, match=rf"^_target_ must name a function or class, got '{target}'"):
+            build({"_target_": target}, place="env", allowed=[target])
+
+
+def test_what_a_logger_only_shows_is_not_built():
+    settings = {"_target_": "builtins.dict", "settings": {"env": dict(GRID)}, "_recursive_": False, "_convert_": "all"}
+    found = build(settings, place="logger.loggers[0]", allowed=["builtins.dict"])
+    assert found == {"settings": {"env": GRID}} and found["settings"] is not settings["settings"]
+
+
+@pytest.mark.parametrize("mark", [{"_partial_": True}, {"_args_": [3]}, {"_recursive_": True}], ids=str)
+def test_no_other_mark_of_hydra_is_followed(mark):
+    with pytest.raises(SettingsError, match=rf"^env\.{next(iter(mark))} must be left out, got "):
+        build({"_target_": "builtins.dict"} | mark, place="env", allowed=["builtins.dict"])

@@ -1,0 +1,76 @@
+"""The command line of the programs that look at runs: ``key=value`` arguments."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from omegaconf import MISSING, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.commands import as_called
+
+
+def check_place(path: Path, key: str) -> None:
+    """Refuses a file that can't be written, before anything is done; makes its folder.
+
+    Args:
+        path: the file.
+        key: the setting that names it.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe = path.with_name(f".{path.name}.partial")
+        probe.touch()
+        probe.unlink()
+        if path.is_dir():
+            raise IsADirectoryError("it is a folder")
+    except OSError as error:
+        raise SettingsError(f"{key} must be a file that can be written, got {str(path)!r} ({error}).") from error
+
+
+def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
+    """Calls ``run`` with an instance of ``schema`` filled from ``key=value`` arguments; ends with a message if wrong.
+
+    Args:
+        schema: dataclass of the settings; ``MISSING`` marks those that must be given.
+        doc: what ``--help`` prints.
+        run: does the work.
+    """
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments) or not arguments:
+        print(as_called(doc.strip()))
+        sys.exit(0 if arguments else 2)
+    try:
+        if wrong := [argument for argument in arguments if "=" not in argument]:
+            raise SettingsError(f"an argument must read key=value, got {wrong[0]!r}; --help shows all of them.")
+        pairs = [argument.split("=", 1) for argument in arguments]
+        texts = {key: value for key, value in pairs if _is_text(schema, key, value)}
+        read = [f"{key}={'text' if key in texts else value}" for key, value in pairs]
+        try:
+            settings = OmegaConf.merge(OmegaConf.structured(schema), OmegaConf.from_dotlist(read))
+        except (OmegaConfBaseException, YAMLError) as error:
+            known = ", ".join(each.name for each in fields(schema))
+            raise SettingsError(f"{str(error).splitlines()[0]}; the settings are {known}.") from error
+        if missing := OmegaConf.missing_keys(settings):
+            raise SettingsError(f"{min(missing)} must be given: {min(missing)}=...; --help shows all settings.")
+        run(replace(OmegaConf.to_object(settings), **texts))  # type: ignore[type-var]
+    except SettingsError as error:
+        sys.exit(f"error: {error}")
+
+
+def _is_text(schema: type, key: str, value: str) -> bool:
+    """Whether a value is meant as it stands, and not as YAML: ``#``, ``:``, ``*`` and ``null`` are parts of names, too.
+
+    Settings of any type (``runs``, ``out``) take a text or a ``[list]``.
+    """
+    hint = get_type_hints(schema).get(key)
+    if hint is Any:
+        optional = getattr(schema, key, MISSING) != MISSING  # then it may be null
+        return not (value.startswith("[") and value.endswith("]")) and not (optional and value == "null")
+    return hint in (str, str | None)

@@ -1,0 +1,77 @@
+"""Weights alone: a policy's, from a run's checkpoints or from a file of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torchrl.checkpoint import CheckpointError
+
+from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.durable import sync
+from hdrqn_torchrl.runs.files import replaced
+from hdrqn_torchrl.runs.serialization import check_tensors
+
+
+def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
+    """Loads a policy's weights from a run.
+
+    Args:
+        policy: built with the settings of the run.
+        directory: the run's folder of checkpoints.
+        which: ``"best"``, ``"last"``, or the path of a checkpoint or of a file of :func:`save_weights`.
+
+    Raises:
+        ValueError: if there is none, it is damaged, or it does not fit.
+    """
+    checkpoints = Checkpoints(directory)
+    try:
+        path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
+        if path is None:
+            raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
+        if path.is_file():
+            load_weights(policy, path)
+        else:
+            checkpoints.load({"policy": policy}, path)
+    except CheckpointError as error:
+        raise ValueError(f"checkpoint can't be loaded: {error}") from error
+
+
+def save_weights(module: nn.Module, path: Path) -> None:
+    """Writes a module's parameters and buffers to ``path``, which is either the whole file or the one before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    weights = {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
+    with replaced(path) as partial:
+        save_file(weights, partial)
+    sync(path.parent)
+
+
+def load_weights(module: nn.Module, path: Path) -> None:
+    """Reads what :func:`save_weights` wrote into ``module``.
+
+    Raises:
+        ValueError: if there is no such file, it is of another kind, or it does not fit the module.
+    """
+    try:
+        module.load_state_dict(read_weights(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """What :func:`save_weights` wrote, by name.
+
+    Raises:
+        ValueError: if there is no such file, or it is of another kind.
+    """
+    if not path.is_file():
+        raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
+    try:
+        check_tensors(path)
+        return load_file(path)
+    except (SafetensorError, ValueError) as error:
+        raise ValueError(
+            f"{path} must be a safetensors file, got something else ({error}); see checkpoints/."
+        ) from error

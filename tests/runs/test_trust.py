@@ -1,0 +1,58 @@
+"""What settings may build."""
+
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+from run_folders import CONF, configure
+
+from hdrqn_torchrl.cli.configuration import plain, resolved
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings import check
+from hdrqn_torchrl.runs.trust import ALLOWED_TARGETS, check_targets
+
+
+@pytest.fixture
+def settings():
+    return configure()
+
+
+class TestCheckTargets:
+    def test_what_the_files_of_conf_name_is_allowed(self):
+        groups = ("env", "algo", "network", "logger", "experiment")
+        files = [file for group in groups for file in (Path(CONF) / group).glob("*.yaml")]
+        named = {name for file in files for name in re.findall(r"_target_: (\S+)", file.read_text())}
+        assert named <= set(ALLOWED_TARGETS) and len(named) > 8
+
+    @pytest.mark.parametrize("target", ALLOWED_TARGETS)
+    def test_every_allowed_name_is_a_builder_of_this_package(self, target):
+        module, _, name = target.rpartition(".")
+        assert module.startswith("hdrqn_torchrl.") and callable(getattr(importlib.import_module(module), name))
+
+    @pytest.mark.parametrize(
+        ("key", "value", "path"),
+        [
+            ("env", {"_target_": "os.system", "command": "true"}, "env._target_"),
+            ("algo.sub._target_", "hdrqn_torchrl.runs.checkpoint.os.system", "algo.sub._target_"),
+            ("network.extra", {"deep": [1, [{"_target_": "posix.system"}]]}, "network.extra.deep[1][0]._target_"),
+            ("logger.loggers", [{"_target_": "builtins.exec"}], "logger.loggers[0]._target_"),
+            ("network._target_", 3, "network._target_"),
+            ("network._target_", None, "network._target_"),
+        ],
+    )
+    def test_all_others_are_refused_by_their_place(self, settings, key, value, path):
+        OmegaConf.update(settings, key, value, merge=False, force_add=True)
+        with pytest.raises(
+            SettingsError, match=f"^{re.escape(path)} must be one of the builders that .* trusts there, got "
+        ):
+            check_targets(plain(settings), [])
+
+    def test_ones_own_builders_can_be_added(self, settings):
+        settings.env._target_ = "my_package.MyEnv"
+        with pytest.raises(SettingsError, match=r"add 'allowed_targets=\[my_package\.MyEnv\]' to the command"):
+            check_targets(plain(settings), ["my_package.Other"])
+        check_targets(plain(settings), ["my_package.MyEnv"])
+        settings.allowed_targets = ["my_package.MyEnv"]
+        check(resolved(settings))
