@@ -16,14 +16,15 @@ import torch
 from helpers import check_same_checkpoint, make_collector, table
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
-from hydra.utils import instantiate
 from omegaconf import OmegaConf
 from processes import leftovers, limit_file_size, limited_file_size, run_script, start_script
 from programs import CONF, ROOT, TINY, TINY_HDRQN, call
 from safetensors.torch import load_file
 
 from hdrqn_torchrl.cli import train
+from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.learning import Learner
+from hdrqn_torchrl.runs.building import build, build_algorithm
 from hdrqn_torchrl.runs.durable import verify
 from hdrqn_torchrl.runs.folder import locked
 from hdrqn_torchrl.runs.logging import CSVLog
@@ -49,10 +50,10 @@ class TestTree:
     @pytest.mark.parametrize("env", choices("env"))
     def test_every_combination_composes_builds_and_collects(self, env, algo, network):
         config = configure(f"env={env}", f"algo={algo}", f"network={network}", "env.num_envs=2")
-        train.check(config)
         config.network.hidden_size = 8
-        base = instantiate(config.env, seed=0)
-        algorithm = instantiate(config.algo, base, instantiate(config.network))
+        settings = resolved(config)
+        train.check(settings)
+        base, algorithm = build_algorithm(settings, {"seed": 0})
         assert set(algorithm.explorations) in ({"flat"}, {"sub", "meta"})
         assert set(algorithm.learners) == ({"joint"} if algo == "v3" else set(algorithm.explorations))
         batch = next(iter(make_collector(algorithm, base, 2)))
@@ -64,9 +65,9 @@ class TestTree:
     def test_every_experiment_composes_and_builds(self, experiment):
         plain, config = configure(), configure(f"experiment={experiment}")
         assert config != plain
-        train.check(config)
-        base = instantiate(config.env, num_envs=2)
-        assert instantiate(config.algo, base, instantiate(config.network)).learners
+        settings = resolved(config)
+        train.check(settings)
+        assert build_algorithm(settings, {"num_envs": 2})[1].learners
 
     @pytest.mark.parametrize("experiment", choices("experiment"))
     def test_the_command_line_wins_over_an_experiment(self, experiment):
@@ -75,12 +76,13 @@ class TestTree:
 
     @pytest.mark.parametrize("logger", ["csv", "tensorboard"])  # the others are extras: tests/test_logging.py
     def test_every_logger_builds(self, logger, tmp_path):
-        loggers = [instantiate(each, tmp_path) for each in configure(f"logger={logger}").logger.loggers]
+        settings = resolved(configure(f"logger={logger}")).logger["loggers"]
+        loggers = [build(each, tmp_path, place="logger.loggers[0]") for each in settings]
         assert all(hasattr(each, "log_scalar") for each in loggers)
 
     def test_the_levels_are_configured_apart(self):
         config = configure("algo=v2", "algo.sub.slice_len=3", "algo.meta.slice_len=2", "algo.sub_exploration.end=0.3")
-        algorithm = instantiate(config.algo, instantiate(config.env, num_envs=2), instantiate(config.network))
+        _, algorithm = build_algorithm(resolved(config), {"num_envs": 2})
         assert [learner.settings.slice_len for learner in algorithm.learners.values()] == [3, 2]
         assert algorithm.explorations["sub"].end == 0.3 != algorithm.explorations["meta"].end
 
@@ -244,7 +246,11 @@ class TestStoppingAndResuming:
         run = wait_for_row(same, 512, process)
         assert stop(process, signal.SIGTERM) == 143
         told = (same / "stderr.txt").read_text()
-        assert f"stopped by SIGTERM; `python train.py resume={run}` goes on" in told and "Traceback" not in told
+        assert (
+            f"train.py resume={run}` goes on" in told
+            and "stopped by SIGTERM; `python " in told
+            and "Traceback" not in told
+        )
         self.check_stopped(run, before=2048)
 
         process = start_script(same, f"resume={run.relative_to(same)}", "hydra.job.chdir=true")  # which moves no path
@@ -475,7 +481,7 @@ class TestFailures:
         code, _, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=fill_disk_at_next_row)
         assert code == 1 and "Traceback" not in told
         line = told.strip().splitlines()[-1]
-        assert "File too large" in line and "when that is fixed, `python train.py resume=run` goes on" in line
+        assert "File too large" in line and "train.py resume=run` goes on from the last checkpoint" in line
 
     def test_a_number_that_is_none(self, a_run):
         code, printed, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=poison_updates)
