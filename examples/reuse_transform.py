@@ -66,7 +66,7 @@ def make_learners(sub: modules.SubController, meta: modules.MetaController) -> d
     ends = {"reward": "intrinsic_reward", "done": "option_done", "terminated": "option_terminated"}
     steps = StepSelector(
         root_keys=["observation", "action", "option_init"],
-        next_keys=["observation", *ends.values()],
+        next_keys=[*ends.values()],
         subgoal_key="subgoal",
     )
     options = OptionExtractor(input_keys=meta.input_keys, mask_key=None)

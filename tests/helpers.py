@@ -212,6 +212,23 @@ def batches_of(steps: TensorDictBase, length: int) -> list[TensorDictBase]:
     return [steps[:, start : start + length] for start in range(0, steps.shape[1] - length + 1, length)]
 
 
+def options_of(rows: TensorDictBase, *inputs: str) -> tuple[TensorDictBase, torch.Tensor]:
+    """Options among stored rows ``[M]``, with what each led to under ``"next"``, as the row behind it shows.
+
+    Final rows are taken out, and the options before them are done. Returns with the options where what they led to is
+    known, ``[M]`` bool.
+    """
+    after, behind = rows["next"], rows.roll(-1, 0)
+    final = (after["done"] & ~after["terminated"]).squeeze(-1)
+    known = rows["collector", "traj_ids"] == behind["collector", "traj_ids"]
+    known[-1] = False
+    options = rows.clone()
+    for key in inputs:
+        options["next", key] = behind[key]
+    options["next", "done"] = after["done"] | (final.roll(-1, 0) & known).unsqueeze(-1)
+    return options[~final], known[~final]
+
+
 def unroll_by_steps(network, observation, condition=None, init=None, first=None):
     """What ``QNetwork.unroll`` computes, as a plain loop over single decisions: ``[B, T, A]``."""
     rows = []

@@ -111,7 +111,7 @@ def make_recurrent_loss(
     loss_keys: Mapping[str, NestedKey | None] | None = None,
     prediction_weight: float = 0.1,
 ) -> RecurrentDQNLoss:
-    """The loss of one level, as its settings have it.
+    """The loss of one level, as its settings have it, for sequences that hold each observation once.
 
     Args:
         network: the controller that is trained.
@@ -134,7 +134,7 @@ def make_recurrent_loss(
         max_target=largest_target(settings.max_target, largest_return),
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
-        lookahead=settings.lookahead(),
+        lookahead=1 + settings.lookahead(),  # observations are stored once
         state_keys=stored_states(network, settings),
         predictor=network.network.predictor,
         prediction_weight=prediction_weight,

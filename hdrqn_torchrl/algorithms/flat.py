@@ -60,7 +60,7 @@ def make_drqn(
             learner,
             extract=StepSelector(
                 root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
-                next_keys=[keys.OBSERVATION, keys.REWARD],
+                next_keys=[keys.REWARD],
             ),
             loss=make_recurrent_loss(
                 policy,

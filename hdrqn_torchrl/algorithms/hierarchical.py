@@ -181,7 +181,6 @@ def make_hdrqn(
                     *root_extra,
                 ],
                 next_keys=[
-                    keys.OBSERVATION,
                     keys.INTRINSIC_REWARD,
                     keys.OPTION_DONE,
                     keys.OPTION_TERMINATED,
@@ -232,7 +231,7 @@ def make_hdrqn(
                     "action_mask": mask_key,
                 },
             ),
-            episode_len=has.task.max_steps,
+            episode_len=None if has.task.max_steps is None else has.task.max_steps + 1,  # a row may end it
             refresh=refresh,
         )
 

@@ -52,10 +52,10 @@ def relabel_subgoals(
         rewards: what the option book paid by.
         state_keys: recurrent states stored with the steps, if any. They come from the subgoal that was pursued; told
             for another one, a sequence starts from zero.
-        subgoal_key: subgoal in force, at the root and under ``"next"``.
+        subgoal_key: subgoal in force.
         attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``;
             ``hazard_key=None``: no hazard.
-        mask_key, option_init_key: at the root.
+        mask_key, option_init_key: at the root, like the subgoal.
         eligible_key: written at the root, for :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss`.
 
     Returns:
@@ -84,8 +84,7 @@ def relabel_subgoals(
         (after, intrinsic_reward_key, reward),
     ):
         part.set(key, torch.where(shift > 0, value, part.get(key)))
-    for part in (told, after):
-        part.set(subgoal_key, subgoal.squeeze(-1))
+    told.set(subgoal_key, subgoal.squeeze(-1))
     for key in state_keys:
         told.set(key, told.get(key).masked_fill(shift > 0, 0.0))
     return told.set(eligible_key, (shift == 0) | left.gather(-1, subgoal))

@@ -77,25 +77,22 @@ def refresh_hidden(
     Args:
         sub_controller: whose states they are.
         max_steps: L of :class:`OptionHistory`; states after longer options stay as they were stored.
-        sample: transitions ``[B, T]`` of an ``OptionExtractor(history=...)``.
+        sample: rows ``[B, T]`` of an ``OptionExtractor(history=...)``.
         read_last_observation: whether the states include the observation in which the option ended.
 
     Returns:
-        ``sample``, with new states at its root (where the last option ended) and under ``"next"``.
+        ``sample``, with new states where the option before ended.
     """
-    for part in (sample, sample.get("next")):
-        steps = part.get(HISTORY_STEPS).squeeze(-1).flatten()  # [B * T]; 0: the episode starts, the state is zero
-        rows = ((steps > 0) & (steps <= max_steps)).nonzero().squeeze(-1)
-        if not len(rows):
-            continue
-        lengths = steps[rows] + int(read_last_observation)
-        histories = part.get(HISTORY).flatten(0, 1)[rows][:, : int(lengths.max())]
-        subgoals = part.get(HISTORY_SUBGOAL).flatten()[rows].unsqueeze(-1).expand(histories.shape[:2])
-        for key, state in zip(
-            (sub_controller.hidden_key, sub_controller.cell_key),
-            sub_controller.network.final_state(histories, subgoals, lengths),
-            strict=True,
-        ):
-            if (stored := part.get(key, None)) is not None:
-                part.set(key, stored.flatten(0, 1).index_copy(0, rows, state).view_as(stored))
+    steps = sample.get(HISTORY_STEPS).squeeze(-1).flatten()  # [B * T]; 0: the episode starts, the state is zero
+    rows = ((steps > 0) & (steps <= max_steps)).nonzero().squeeze(-1)
+    if not len(rows):
+        return sample
+    lengths = steps[rows] + int(read_last_observation)
+    histories = sample.get(HISTORY).flatten(0, 1)[rows][:, : int(lengths.max())]
+    subgoals = sample.get(HISTORY_SUBGOAL).flatten()[rows].unsqueeze(-1).expand(histories.shape[:2])
+    state_keys = sub_controller.hidden_key, sub_controller.cell_key
+    states = sub_controller.network.final_state(histories, subgoals, lengths)
+    for key, state in zip(state_keys, states, strict=True):
+        if (stored := sample.get(key, None)) is not None:
+            sample.set(key, stored.flatten(0, 1).index_copy(0, rows, state).view_as(stored))
     return sample

@@ -10,15 +10,24 @@ from hdrqn_torchrl import keys
 
 
 class LongerEpisodes:
-    """Looks out for an episode of more than so many transitions among those that are stored.
+    """Looks out for an episode of more transitions than a sequence has, among those that are stored.
 
     Args:
-        length: transitions of an episode that is not longer.
+        length: transitions of a sequence.
         init_key: first transition of an episode.
+        done_key, terminated_key: under ``"next"``; of rows, those that are done and not terminated hold no transition
+            (:class:`~hdrqn_torchrl.data.OptionExtractor`).
     """
 
-    def __init__(self, length: int, *, init_key: NestedKey = keys.IS_INIT) -> None:
-        self.length, self.init_key = length, init_key
+    def __init__(
+        self,
+        length: int,
+        *,
+        init_key: NestedKey = keys.IS_INIT,
+        done_key: NestedKey = keys.DONE,
+        terminated_key: NestedKey = keys.TERMINATED,
+    ) -> None:
+        self.length, self.init_key, self.done_key, self.terminated_key = length, init_key, done_key, terminated_key
         self._age: Tensor | None = None  # [N, 1]: transitions of the episode in progress
 
     def seen(self, transitions: TensorDictBase) -> bool:
@@ -31,9 +40,12 @@ class LongerEpisodes:
             (False, True)
         """
         init = transitions.get(self.init_key).squeeze(-1)
-        rows = init.ndim == 1
-        if rows:
-            init, self._age = init.unsqueeze(0), None
+        if init.ndim == 1:
+            after = transitions.get("next")
+            final = (after.get(self.done_key) & ~after.get(self.terminated_key)).squeeze(-1)
+            init, self._age = init[~final].unsqueeze(0), None
+        if not init.shape[1]:
+            return False
         before = torch.zeros_like(init[:, :1], dtype=torch.int64) if self._age is None else self._age
         step = torch.arange(init.shape[1], device=init.device)
         start = torch.where(init, step, -1).cummax(1).values

@@ -6,8 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
-from tensordict.utils import unravel_key
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 
 from hdrqn_torchrl import keys
@@ -15,26 +14,37 @@ from hdrqn_torchrl.data.history import HISTORY, HISTORY_STEPS, HISTORY_SUBGOAL, 
 
 
 class OptionExtractor:
-    r"""Turns collected steps ``[N, T]`` into option transitions :math:`(\hat{o}_0, g, r^{ex}_{total}, \hat{o}')`.
+    r"""Turns collected steps ``[N, T]`` into rows :math:`(\hat{o}, g, r^{ex}_{total})`, one for each option.
 
-    A transition pairs the step at which an option started with the one at which it ended, however many
-    batches lie between them. Transitions come out by whole episodes, each in order and without gaps, once the
-    episode is over; so a replay buffer can hold them row by row. Of an episode that is very long or has no end, a piece
-    comes out now and then: each transition is as it would have been, but sequences do not go from one piece to the
-    next unless they lie side by side. Batches must come from one collector, in order, with the same N environments.
+    A row joins the step at which an option started with the one at which it ended, however many batches lie between
+    them. What an option led to is what the next row of its episode starts from, so it is not stored again. Where an
+    episode is truncated, and nothing follows, one more row holds its last inputs: a *final row*, done and not
+    terminated, with nothing chosen. It can't be trained; samplers never begin with it.
+
+    Rows come out by whole episodes, each in order and without gaps, once the episode is over; so a replay buffer can
+    hold them one after the other. Of an episode that is very long or has no end, a piece comes out now and then. A
+    piece, too, ends with a final row: a copy of the row that the next piece begins with. So each option is learned
+    from, but sequences do not go from one piece to the next. Batches must come from one collector, in order, with the
+    same N environments.
 
     Args:
-        input_keys: what the meta-controller reads; kept from the start and, under ``"next"``, from the end.
+        input_keys: what the controller reads, kept from where the option started.
         mask_key: subgoals that can be chosen, kept likewise; ``None``: no mask.
-        subgoal_key: name of the chosen subgoal in the transitions (its value is ``active_subgoal_key``'s).
+        subgoal_key: name of the chosen subgoal in the rows (its value is ``active_subgoal_key``'s).
         option_init_key, option_done_key, option_steps_key, option_return_key, active_subgoal_key: entries of
             :class:`~hdrqn_torchrl.transforms.SubgoalTransform`.
-        init_key: first step of an episode.
+        init_key: where the controller's recurrent state restarts: at the first step of an episode, or, below another
+            level, where that one's option starts.
+        done_key, terminated_key: under ``"next"``, end of what the controller pursues: the episode, or the option of
+            the level above.
+        condition_key: name, in the rows, of the subgoal that the level above pursued; ``None``: there is no such level.
+        active_condition_key: the entry that has its value, under ``"next"``.
         traj_key: number of the episode.
-        at_end: changes the entries ``[M]`` of the steps at which options ended before they are kept; for inputs
-            that the environment's step does not hold.
-        state_keys: kept from the start only: the meta-controller's LSTM state before it chose.
-        history: keeps the observations of whole options in the transitions, so that
+        at_end: changes the entries ``[M]`` of the steps at which truncated episodes ended before they are kept; for
+            inputs that the environment's step does not hold.
+        state_keys: more entries of the step at which the option started, the controller's recurrent state for
+            instance; final rows have none.
+        history: keeps the observations of the option before in each row, so that
             :func:`~hdrqn_torchrl.data.refresh_hidden` can compute v2's inputs anew.
         max_held: finished options of an unfinished episode that are held back, for each environment; if there are more,
             they come out.
@@ -67,6 +77,10 @@ class OptionExtractor:
         option_return_key: NestedKey = keys.OPTION_RETURN,
         active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
         init_key: NestedKey = keys.IS_INIT,
+        done_key: NestedKey = keys.DONE,
+        terminated_key: NestedKey = keys.TERMINATED,
+        condition_key: NestedKey | None = None,
+        active_condition_key: NestedKey = keys.ACTIVE_SUBGOAL,
         traj_key: NestedKey = keys.TRAJ_IDS,
         at_end: Callable[[TensorDictBase], TensorDictBase] | None = None,
         state_keys: Sequence[NestedKey] = (),
@@ -77,13 +91,13 @@ class OptionExtractor:
             raise ValueError(f"max_held must be >= 1 option, got {max_held}; use some multiple of slice_len.")
         self.max_held = max_held
         self.at_end, self.history = at_end, history
-        self.init_key, self.traj_key, self.option_steps_key = init_key, traj_key, option_steps_key
+        self.init_key, self.done_key, self.terminated_key = init_key, done_key, terminated_key
+        self.condition_key, self.active_condition_key = condition_key, active_condition_key
+        self.traj_key, self.option_steps_key = traj_key, option_steps_key
         self.option_init_key, self.option_done_key = option_init_key, option_done_key
         self.active_subgoal_key, self.subgoal_key = active_subgoal_key, subgoal_key
-        self.option_return_key, self.input_keys = option_return_key, list(input_keys)
-        inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
-        self._start_keys = [*inputs, *state_keys, init_key, traj_key]
-        self._end_keys = [*inputs, option_steps_key, option_return_key, keys.DONE, keys.TERMINATED]
+        self.option_return_key, self.input_keys, self.state_keys = option_return_key, list(input_keys), list(state_keys)
+        self._inputs = [*input_keys, *([] if mask_key is None else [mask_key])]
         self.reset()
 
     def reset(self) -> None:
@@ -91,12 +105,11 @@ class OptionExtractor:
         self._open_starts: TensorDictBase | None = None  # [N]: start of the option in progress
         self._is_open: Tensor | None = None  # [N]
         self._held: TensorDictBase | None = None  # [M]: finished options of unfinished episodes
-        self._last: TensorDictBase | None = None  # [N]: the last one that came out of an unfinished episode
         if self.history is not None:
             self.history.reset()
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase | None:
-        """Returns the options ``[M]`` of all episodes that ended in ``batch`` ``[N, T]``; ``None`` if none did.
+        """Returns the rows ``[M]`` of all episodes that ended in ``batch`` ``[N, T]``; ``None`` if none did.
 
         Raises:
             ValueError: if the batch is of another number of environments than the ones before.
@@ -106,9 +119,11 @@ class OptionExtractor:
                 f"batch must hold the same {len(self._is_open)} environments as those before, got {len(batch)}; give "
                 "each memory the batches of one collector."
             )
-        starts = batch.select(*self._start_keys)
+        starts = batch.select(*self._inputs, *self.state_keys, self.init_key, self.traj_key)
+        if self.condition_key is not None:
+            starts.set(self.condition_key, batch.get("next").get(self.active_condition_key))
         started = batch.get(self.option_init_key).squeeze(-1)
-        ended = batch.get(unravel_key(("next", self.option_done_key))).squeeze(-1)
+        ended = batch.get("next").get(self.option_done_key).squeeze(-1)
         if self._is_open is None or self._open_starts is None:
             self._open_starts, self._is_open = starts[:, 0].clone(), torch.zeros_like(started[:, 0])
         starts = torch.cat([self._open_starts.unsqueeze(1), starts], 1)  # [N, 1 + T]: in progress, then new
@@ -125,92 +140,111 @@ class OptionExtractor:
         environments = torch.arange(len(started), device=started.device)
         self._open_starts = starts[environments, last_start]
         started[environments, last_start] &= ~self._is_open
-        options = self._pair(batch, starts, started, ended)
-        if histories is not None:
-            after = options.get("next")
-            after.set(HISTORY, histories)
-            after.set(HISTORY_SUBGOAL, options.get(self.subgoal_key))
-            after.set(HISTORY_STEPS, after.get(self.option_steps_key))
-        return self._release(options, num_envs=len(batch))
+        return self._release(self._pair(batch, starts, started, ended, histories), num_envs=len(batch))
 
-    def _pair(self, batch: TensorDictBase, starts: TensorDictBase, started: Tensor, ended: Tensor) -> TensorDictBase:
+    def _pair(
+        self, batch: TensorDictBase, starts: TensorDictBase, started: Tensor, ended: Tensor, histories: Tensor | None
+    ) -> TensorDictBase:
+        """Rows of the options that ended, and final rows where episodes were truncated."""
         environment, end_time = ended.nonzero(as_tuple=True)
         options = starts[started.nonzero(as_tuple=True)]  # and not by mask: a GPU would count anew for every entry
         after = batch.get("next")[environment, end_time]
+        options.set(self.subgoal_key, after.get(self.active_subgoal_key))
+        ends = after.select(self.option_steps_key, self.option_return_key, self.done_key, self.terminated_key)
+        options.set("next", ends).set(_ENVIRONMENT, environment).set(_OVER, after.get(keys.DONE).squeeze(-1))
+        if histories is not None:
+            steps, subgoal = after.get(self.option_steps_key), options.get(self.subgoal_key)
+            own = TensorDict({HISTORY: histories, HISTORY_SUBGOAL: subgoal, HISTORY_STEPS: steps}, options.batch_size)
+            options.update(own.apply(torch.zeros_like)).set(_OWN, own)
+        truncated = options.get(_OVER) & ~after.get(self.terminated_key).squeeze(-1)
+        cut = truncated.nonzero().squeeze(-1)
+        if not len(cut):
+            return options
+        final = self._as_final(self._show(options[cut], after[cut]))
+        options.set(_OVER, options.get(_OVER) & ~truncated)
+        options.get("next").set(self.done_key, ends.get(self.done_key) & ~truncated.unsqueeze(-1))
+        order = torch.cat([2 * torch.arange(len(options), device=cut.device), 2 * cut + 1]).argsort()
+        return torch.cat([options, final])[order]
+
+    def _show(self, rows: TensorDictBase, after: TensorDictBase) -> TensorDictBase:
+        """Rows that show what steps led to."""
         if self.at_end is not None:
             after = self.at_end(after)
-        options.set(self.subgoal_key, after.get(self.active_subgoal_key))
-        options.set("next", select_after(after, self._end_keys))
-        return options.set("environment", environment)
+        rows.update(after.select(*self._inputs))
+        if self.condition_key is not None:
+            rows.set(self.condition_key, after.get(self.active_condition_key))
+        for key in (self.init_key, *self.state_keys):
+            rows.set(key, torch.zeros_like(rows.get(key)))
+        return rows
+
+    def _as_final(self, rows: TensorDictBase) -> TensorDictBase:
+        """Marks rows at which nothing was chosen: done, not terminated."""
+        ends = rows.get("next").apply(torch.zeros_like)
+        ends.set(self.done_key, torch.ones_like(ends.get(self.done_key)))
+        return rows.set("next", ends).set(_OVER, torch.ones_like(rows.get(_OVER)))
 
     def _release(self, options: TensorDictBase, num_envs: int) -> TensorDictBase | None:
         if self._held is not None:
-            options = torch.cat([self._held, options], 0)
-            options = options[options.get("environment").argsort(stable=True)]
-        environment, rows = options.get("environment"), torch.arange(len(options), device=options.device)
-        ends = torch.where(options.get(("next", keys.DONE)).squeeze(-1), rows, -1)
+            options = _by_environment(self._held, options)
+        if self.history is not None:
+            self._look_back(options)
+        environment, rows = options.get(_ENVIRONMENT), torch.arange(len(options), device=options.device)
+        ends = torch.where(options.get(_OVER), rows, -1)
         last_end = rows.new_full((num_envs,), -1).scatter_reduce(0, environment, ends, "amax")
         complete = rows <= last_end[environment]
         held = torch.zeros_like(last_end).scatter_add(0, environment, (~complete).long())
         goes_on = held > self.max_held  # [N]
+        newest = rows.new_zeros(num_envs).scatter_reduce(0, environment, rows, "amax")[goes_on]
         complete |= goes_on[environment]
+        complete[newest] = False  # the next piece begins with it
         self._held = options[(~complete).nonzero().squeeze(-1)]
         released = options[complete.nonzero().squeeze(-1)]
-        if self.history is not None:
-            self._look_back(released, goes_on)
-        return released.exclude("environment") if len(released) else None
+        if len(newest):
+            released = _by_environment(released, self._as_final(options[newest]))
+        return released.exclude(_ENVIRONMENT, _OVER, _OWN) if len(released) else None
 
-    def _look_back(self, options: TensorDictBase, goes_on: Tensor) -> None:
-        """Gives each option the history of the one before it in its episode: what its first input comes from."""
-        traj, environment = options.get(self.traj_key), options.get("environment")
-        first = options.get(self.init_key).flatten() | (traj != traj.roll(1))  # or its predecessor is unknown
-        first[:1] = True
-        names = (HISTORY, HISTORY_SUBGOAL, HISTORY_STEPS)
-        for key in names:
-            before = options.get(("next", key)).roll(1, 0)
-            options.set(key, before.masked_fill(first.view(-1, *[1] * (before.ndim - 1)), 0))
-        if self._last is not None:  # of an episode that goes on
-            before = self._last[environment]
-            known = first & ~options.get(self.init_key).flatten() & (before.get(self.traj_key) == traj)
-            known &= before.get("environment") == environment
-            for key in names:
-                options.get(key)[known] = before.get(("next", key))[known]
-        if goes_on.any():
-            rows = torch.arange(len(options), device=traj.device)
-            newest = rows.new_zeros(len(goes_on)).scatter_reduce(0, environment, rows, "amax")
-            last = options[newest].select("environment", self.traj_key, *(("next", key) for key in names))
-            if self._last is not None:
-                last = last.where(goes_on, self._last)
-            self._last = last
+    def _look_back(self, options: TensorDictBase) -> None:
+        """Gives each row the history of the option before it in its episode: what its input comes from."""
+        traj, environment = options.get(self.traj_key), options.get(_ENVIRONMENT)
+        follows = (traj == traj.roll(1)) & (environment == environment.roll(1))
+        follows[:1] = False
+        for key in (HISTORY, HISTORY_SUBGOAL, HISTORY_STEPS):
+            before, known = options.get((_OWN, key)).roll(1, 0), options.get(key)
+            options.set(key, torch.where(follows.view(-1, *[1] * (known.ndim - 1)), before, known))
 
     def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""
         state: dict[str, Any] = {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
-        if self._last is not None:
-            state["last"] = self._last
         return state if self.history is None else {**state, "history": self.history.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned."""
+        """Restores what :meth:`state_dict` returned. Rows of versions that stored inputs twice are forgotten."""
         self._open_starts, self._is_open, self._held = state["open_starts"], state["is_open"], state["held"]
-        self._last = state.get("last")
+        if self._held is not None and _OVER not in self._held:
+            self._held = None
         if self.history is not None:
             self.history.load_state_dict(state["history"])
 
 
-def select_after(after: TensorDictBase, wanted: Sequence[NestedKey]) -> TensorDictBase:
-    """What is kept of what followed; ``truncated`` as well, which not every environment has."""
-    return after.select(*wanted, *([keys.TRUNCATED] if keys.TRUNCATED in after else []))
+_ENVIRONMENT, _OVER, _OWN = "environment", "over", "own"
+"""What only held rows have: whose they are, whether their episode is over, and their own history."""
+
+
+def _by_environment(*rows: TensorDictBase) -> TensorDictBase:
+    together: TensorDictBase = torch.cat(rows)  # type: ignore[assignment]
+    return together[together.get(_ENVIRONMENT).argsort(stable=True)]
 
 
 class StepSelector:
     """Keeps of collected steps ``[N, T]`` what the sub-controller (or a flat agent) learns from.
 
+    What a step led to is what the next one starts from, so observations are kept from the root only.
+
     Args:
         root_keys: entries kept from the root.
-        next_keys: entries kept from ``"next"``, beside the ends of the episode.
-        subgoal_key: if given, the subgoal in force at each step is stored under this name, root and ``"next"``
-            (in a policy's raw output the root entry is a mere proposal).
+        next_keys: entries kept from ``"next"``, besides the ends of the episode.
+        subgoal_key: if given, the subgoal in force at each step is stored under this name (in a policy's raw output
+            this entry is a mere proposal).
         active_subgoal_key: where the environment wrote the subgoal in force.
         traj_key: number of the episode.
     """
@@ -230,13 +264,11 @@ class StepSelector:
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
         """Returns steps ``[N, T]``."""
-        steps = batch.select(*self.root_keys, self.traj_key)
-        after = select_after(batch.get("next"), self.next_keys)
+        steps, after = batch.select(*self.root_keys, self.traj_key), batch.get("next")
         if self.subgoal_key is not None:
-            in_force = batch.get(unravel_key(("next", self.active_subgoal_key)))
-            steps.set(self.subgoal_key, in_force)
-            after.set(self.subgoal_key, in_force)
-        return steps.set("next", after)
+            steps.set(self.subgoal_key, after.get(self.active_subgoal_key))
+        truncated = [keys.TRUNCATED] if keys.TRUNCATED in after else []  # not every environment has it
+        return steps.set("next", after.select(*self.next_keys, *truncated))
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing: it looks at one batch at a time."""

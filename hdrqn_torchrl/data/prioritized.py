@@ -34,6 +34,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         importance_exponent: beta; 1 makes up for the drawing in full, 0 not at all.
         init_key, traj_key, done_key: first step, number and last step of an episode; the first is not read for
             ``"steps"``.
+        terminated_key: as in :class:`~hdrqn_torchrl.data.StepSliceSampler`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -64,11 +65,13 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         init_key: NestedKey = keys.IS_INIT,
         traj_key: NestedKey = keys.TRAJ_IDS,
         done_key: NestedKey = ("next", keys.DONE),
+        terminated_key: NestedKey | None = None,
     ) -> None:
         # The floor eps keeps sequences without error in play.
         super().__init__(capacity, priority_exponent, importance_exponent, eps=1e-3, device="cpu")
         self.slice_len, self.sampling = slice_len, sampling
         self.init_key, self.traj_key, self.done_key = init_key, traj_key, done_key
+        self.terminated_key = terminated_key
         self._forget()
 
     def _forget(self) -> None:
@@ -116,11 +119,14 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         rows = (len(stored), -1)
         episode, done = stored.get(self.traj_key).view(rows), stored.get(self.done_key).view(rows)
         left, ended = steps_left(episode, done, newest)
+        complete = ended | (left >= length)
+        if self.terminated_key is not None:
+            complete &= (left > 1) | stored.get(self.terminated_key).view(rows)
         if self.sampling == "steps":
-            return ended | (left >= length), left
+            return complete, left
         init = stored.get(self.init_key).view(rows)
         if self.sampling == "whole_episodes":
-            return init & (ended | (left >= length)), left
+            return init & complete, left
         return episode_starts(init, episode, done, newest, length), torch.full_like(left, length)
 
     @staticmethod

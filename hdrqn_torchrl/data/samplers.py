@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from tensordict import NestedKey
@@ -23,6 +23,8 @@ class StepSliceSampler(SliceSampler):
     Args:
         slice_len: steps of a slice.
         traj_key: entry that numbers the episodes.
+        terminated_key: if given, the last stored step of an episode starts no slice unless this flag is set: what it
+            led to is not stored, so that there would be nothing to learn from.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -34,7 +36,9 @@ class StepSliceSampler(SliceSampler):
         torch.Size([2, 4])
     """
 
-    def __init__(self, *, slice_len: int, traj_key: NestedKey = keys.TRAJ_IDS) -> None:
+    def __init__(
+        self, *, slice_len: int, traj_key: NestedKey = keys.TRAJ_IDS, terminated_key: NestedKey | None = None
+    ) -> None:
         super().__init__(
             slice_len=slice_len,
             traj_key=traj_key,
@@ -44,22 +48,50 @@ class StepSliceSampler(SliceSampler):
             strict_length=False,
             pad_output=True,
         )
+        self.terminated_key = terminated_key
+        self._found: tuple[int, _Episodes] | None = None  # revision of the storage, and what it holds then
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
+        first, lengths, starts = self._episodes(storage)
         length, count = self._adjusted_batch_size(batch_size)
-        ends = lengths.cumsum(0)
+        ends = starts.cumsum(0)
         step = torch.randint(int(ends[-1]), (count,), device=ends.device, generator=self._rng)
         episode = torch.searchsorted(ends, step, right=True)
-        left = ends[episode] - step  # real steps from the start of the slice on
+        passed = step - ends[episode] + starts[episode]  # steps of the episode before the slice
         start = first[episode]
-        start[:, 0] += lengths[episode] - left
-        return padded_slices(start, left, length, rows=storage.shape[0])
+        start[:, 0] += passed
+        return padded_slices(start, lengths[episode] - passed, length, rows=storage.shape[0])
 
     def can_sample(self, storage: Storage) -> bool:
         """Whether there is a slice to draw from a storage that is not empty."""
-        return True
+        return len(self._episodes(storage).first) > 0
+
+    def _episodes(self, storage: Storage) -> _Episodes:
+        """The stored episodes in which a slice can start."""
+        if self._found is None or self._found[0] != storage._mutation_revision:
+            self._found = storage._mutation_revision, self._find(storage)
+        return self._found[1]
+
+    def _find(self, storage: Storage) -> _Episodes:
+        first, stop, lengths = self._get_stop_and_length(storage)
+        if self.terminated_key is None:
+            return _Episodes(first, lengths, lengths)
+        terminated = storage[:].get(self.terminated_key)[stop.unbind(-1)].flatten()
+        starts = lengths - (~terminated).long()
+        known = starts.nonzero().squeeze(-1)
+        return _Episodes(first[known], lengths[known], starts[known])
+
+
+class _Episodes(NamedTuple):
+    """Episodes of a storage."""
+
+    first: Tensor
+    """Where their first stored steps are, ``[E, ndim]``."""
+    lengths: Tensor
+    """How many steps of each are stored, ``[E]``."""
+    starts: Tensor
+    """At how many of them, from the first on, a slice can start, ``[E]``."""
 
 
 class EpisodeSliceSampler(StepSliceSampler):
@@ -71,23 +103,30 @@ class EpisodeSliceSampler(StepSliceSampler):
         slice_len: steps of a slice.
         lookahead: how many of them, at its end, have no say in where it begins; they are padding where the episode is
             over. So an episode's last steps are shown before these as well.
-        traj_key: entry that numbers the episodes.
+        traj_key, terminated_key: as in :class:`StepSliceSampler`.
     """
 
-    def __init__(self, *, slice_len: int, lookahead: int = 0, traj_key: NestedKey = keys.TRAJ_IDS) -> None:
-        super().__init__(slice_len=slice_len, traj_key=traj_key)
+    def __init__(
+        self,
+        *,
+        slice_len: int,
+        lookahead: int = 0,
+        traj_key: NestedKey = keys.TRAJ_IDS,
+        terminated_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__(slice_len=slice_len, traj_key=traj_key, terminated_key=terminated_key)
         self.lookahead = lookahead
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        first, _, lengths = self._get_stop_and_length(storage)  # [E, ndim], [E]
+        first, lengths, starts = self._episodes(storage)
         length, count = self._adjusted_batch_size(batch_size)
         episode = torch.randint(len(lengths), (count,), device=lengths.device, generator=self._rng)
-        steps, start = lengths[episode], first[episode]
-        places = (steps - (length - self.lookahead)).clamp(min=0) + 1
+        start = first[episode]
+        places = (starts[episode] - (length - self.lookahead)).clamp(min=0) + 1
         passed = (torch.rand(count, device=lengths.device, generator=self._rng) * places).floor().to(start.dtype)
         start[:, 0] += passed
-        return padded_slices(start, steps - passed, length, rows=storage.shape[0])
+        return padded_slices(start, lengths[episode] - passed, length, rows=storage.shape[0])
 
 
 class WholeEpisodeSampler(StepSliceSampler):
@@ -99,36 +138,34 @@ class WholeEpisodeSampler(StepSliceSampler):
     Args:
         slice_len: steps of a slice; an episode's later steps are never shown.
         init_key: first step of an episode.
-        traj_key: entry that numbers the episodes.
+        traj_key, terminated_key: as in :class:`StepSliceSampler`.
     """
 
     def __init__(
-        self, *, slice_len: int, init_key: NestedKey = keys.IS_INIT, traj_key: NestedKey = keys.TRAJ_IDS
+        self,
+        *,
+        slice_len: int,
+        init_key: NestedKey = keys.IS_INIT,
+        traj_key: NestedKey = keys.TRAJ_IDS,
+        terminated_key: NestedKey | None = None,
     ) -> None:
-        super().__init__(slice_len=slice_len, traj_key=traj_key)
+        super().__init__(slice_len=slice_len, traj_key=traj_key, terminated_key=terminated_key)
         self.first_key = init_key
-        self._starts: tuple[int, Tensor, Tensor] | None = None  # revision of the storage, and what it holds then
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
         length, count = self._adjusted_batch_size(batch_size)
-        first, lengths = self._whole(storage)
+        first, lengths, _ = self._episodes(storage)
         if not len(first):  # the ring wrote over the beginning of every episode
             raise RuntimeError("no stored episode has its first step; raise capacity above the length of an episode.")
         chosen = torch.randint(len(first), (count,), device=first.device, generator=self._rng)
         return padded_slices(first[chosen], lengths[chosen], length, rows=storage.shape[0])
 
-    def can_sample(self, storage: Storage) -> bool:
-        """Whether an episode has its first step in a storage that is not empty."""
-        return len(self._whole(storage)[0]) > 0
-
-    def _whole(self, storage: Storage) -> tuple[Tensor, Tensor]:
-        """Where episodes start ``[E, ndim]`` whose first step is stored, and how many steps follow ``[E]``."""
-        if self._starts is None or self._starts[0] != storage._mutation_revision:
-            first, _, lengths = self._get_stop_and_length(storage)
-            whole = storage[:].get(self.first_key)[first.unbind(-1)].flatten().nonzero().squeeze(-1)
-            self._starts = storage._mutation_revision, first[whole], lengths[whole]
-        return self._starts[1:]
+    def _find(self, storage: Storage) -> _Episodes:
+        """Those whose first step is stored."""
+        found = super()._find(storage)
+        whole = storage[:].get(self.first_key)[found.first.unbind(-1)].flatten().nonzero().squeeze(-1)
+        return _Episodes(*(part[whole] for part in found))
 
 
 class EpisodeStartSampler(SliceSampler):

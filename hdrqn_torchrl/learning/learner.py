@@ -11,13 +11,14 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torch.nn import Parameter
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
 from hdrqn_torchrl.data import FROM_STARTS, Continuity, LongerEpisodes, make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.learning.finite import FiniteGuard
+from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision, matrix_products
 from hdrqn_torchrl.learning.settings import LearnerSettings
+from hdrqn_torchrl.learning.stored import check_counters, holds_inputs_twice
 
 
 class Extract(Protocol):
@@ -80,12 +81,7 @@ class Learner:
         self.precision = choose_precision(settings.precision, network)
         self.guard = FiniteGuard(at_once=self.device.type == "cpu")
         self.updates, self.frames = 0, 0
-        groups = _group(self._parameters, separate or {})
-        self._rates = [rate for rate, _ in groups]
-        self.optimizer = torch.optim.Adam(
-            [{"params": parameters} for _, parameters in groups], lr=settings.learning_rate, fused=True
-        )
-        self._set_learning_rate()
+        self.optimizer = GroupedAdam(self._parameters, separate=separate or {}, learning_rate=self.learning_rate)
         if settings.slice_len is None:
             raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
         lookahead = getattr(loss, "lookahead", 0)
@@ -102,6 +98,8 @@ class Learner:
             sampling=settings.sampling,
             priority_exponent=settings.priority_exponent,
             importance_exponent=settings.importance_exponent,
+            # Where inputs are stored once, the last row of an episode has no target unless it terminated.
+            terminated_key=("next", loss.tensor_keys.terminated) if lookahead and num_envs is None else None,
             device=self.device,
         )
         self._continuity = Continuity()
@@ -118,10 +116,6 @@ class Learner:
         progress = min(1.0, self.frames / self.settings.learning_rate_frames)
         return start if end is None else start + (end - start) * progress
 
-    def _set_learning_rate(self) -> None:
-        for share, group in zip(self._rates, self.optimizer.param_groups, strict=True):
-            group["lr"] = share * self.learning_rate
-
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``.
 
@@ -136,7 +130,7 @@ class Learner:
         self._continuity.check(batch)
         self.frames += batch.numel()
         self._drawn = []
-        self._set_learning_rate()
+        self.optimizer.set_learning_rate(self.learning_rate)
         try:
             transitions = self.extract(batch)
         except KeyError as error:
@@ -185,6 +179,10 @@ class Learner:
         owed = int((self.frames - self._warm_at) / self.settings.frames_per_update) - self.updates
         return owed if owed > 0 and self._can_draw() else 0
 
+    def learn(self) -> dict[str, Tensor]:
+        """Draws one minibatch and learns from it: :meth:`update` of :meth:`sample`."""
+        return self.update(self.sample())
+
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
         if not self._drawn:
@@ -211,7 +209,7 @@ class Learner:
         metrics["loss"].backward()
         norm = self._watch_gradients(metrics["loss"])
         if self.settings.max_grad_norm is not None:
-            self._clip_gradients(self.settings.max_grad_norm, norm)
+            self.optimizer.clip_gradients(self.settings.max_grad_norm, norm)
             metrics["grad_norm"] = norm
         self.optimizer.step()
         self.target_updater.step()
@@ -228,14 +226,6 @@ class Learner:
         if skip is not None:
             self.optimizer.found_inf = skip  # type: ignore[attr-defined]  # read by torch's fused Adam
         return norm
-
-    def _clip_gradients(self, largest: float, norm: Tensor) -> None:
-        """Clips the gradients of each part for itself; ``norm`` is that of all together."""
-        groups = [group["params"] for group in self.optimizer.param_groups]
-        for parameters in groups:
-            if len(groups) > 1:
-                norm = torch.nn.utils.get_total_norm([each.grad for each in parameters if each.grad is not None])
-            torch.nn.utils.clip_grads_with_norm_(parameters, largest, norm)
 
     def copy_to_target(self) -> None:
         """Makes the target network the same as the one that is trained."""
@@ -274,7 +264,19 @@ class Learner:
         return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self._warm_at}
 
     def load_memory_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`memory_state_dict` returned."""
+        """Restores what :meth:`memory_state_dict` returned.
+
+        A memory of earlier versions, which kept each observation twice, is left out, with a warning: it would begin
+        empty and is warmed up anew.
+        """
+        if holds_inputs_twice(state["buffer"], self.loss.in_keys):
+            warnings.warn(
+                "the stored replay memory is of an earlier version, which kept each observation twice; it begins empty "
+                "and is warmed up anew, so that the training goes on, but not bit for bit as it would have.",
+                stacklevel=3,
+            )
+            self._begin_empty()
+            return
         self.buffer.load_state_dict(state["buffer"])
         self._drawn, self._warm_at = list(state["drawn"]), state["warm_at"]
 
@@ -284,88 +286,22 @@ class Learner:
         Raises:
             ValueError: if it can't be what a learner of these settings returned.
         """
-        self._check_counters(state)
+        check_counters(state, self.settings)
         self._continuity.reset()
-        self._check_optimizer(state["optimizer"])
-        self.loss.load_state_dict(state["loss"])
         self.optimizer.load_state_dict(state["optimizer"])
-        _lay_out_like_parameters(self.optimizer)
+        self.loss.load_state_dict(state["loss"])
         self.extract.load_state_dict(state["extract"])
         self.updates, self.frames = state["updates"], state["frames"]
         if "buffer" in state:
             self.load_memory_state_dict(state)
         else:
-            if len(self.buffer):
-                self.buffer.empty()
-            done = math.ceil(self.updates * self.settings.frames_per_update)
-            self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)
+            self._begin_empty()
         if self.settings.precision == "auto":  # another machine might choose another one
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
 
-    def _check_optimizer(self, stored: Mapping[str, Any]) -> None:
-        """Refuses moments of other shapes, which Adam would not notice, and other options than its own."""
-        own = self.optimizer.state_dict()["param_groups"]
-        parameters = [each for group in self.optimizer.param_groups for each in group["params"]]
-        same = [
-            all(theirs[key] == mine[key] for key in mine.keys() & theirs.keys() - {"lr"})
-            for mine, theirs in zip(own, stored["param_groups"], strict=True)
-        ]
-        fits = all(
-            0 <= index < len(parameters)
-            and all(
-                moment.dtype == parameters[index].dtype and moment.shape in (torch.Size(), parameters[index].shape)
-                if name == "step"
-                else (moment.dtype, moment.shape) == (parameters[index].dtype, parameters[index].shape)
-                for name, moment in moments.items()
-            )
-            and {"step", "exp_avg", "exp_avg_sq"} <= moments.keys()
-            for index, moments in stored["state"].items()
-        )
-        if not (all(same) and fits):
-            raise ValueError(
-                "the stored optimiser must have the parameters, shapes and options of this one, got others; load it "
-                "with the settings that it was saved with."
-            )
-
-    def _check_counters(self, state: Mapping[str, Any]) -> None:
-        """Refuses counts that no training has: an update would be made for each one that is missing."""
-        for name in ("updates", "frames", "warm_at"):
-            value = state[name]
-            if not isinstance(value, int) or not 0 <= value < 2**53:
-                raise ValueError(
-                    f"the stored learner's {name} must be a whole number in [0, 2**53), got {value!r}; it is damaged: "
-                    "use another checkpoint."
-                )
-        owed = state["frames"] - state["warm_at"] - state["updates"] * self.settings.frames_per_update
-        if owed > max(self.settings.capacity, 1_000_000):
-            raise ValueError(
-                f"the stored learner's updates must make up for its frames, got {state['updates']} for "
-                f"{state['frames']}; load it with the frames_per_update that it was saved with, or use another one."
-            )
-
-
-def _group(parameters: Mapping[str, Parameter], separate: Mapping[str, float]) -> list[tuple[float, list[Parameter]]]:
-    """Shares of the learning rate and whose they are: all that is not separate first."""
-    groups: dict[str, tuple[float, list[Parameter]]] = {name: (rate, []) for name, rate in separate.items()}
-    rest: list[Parameter] = []
-    for name, parameter in parameters.items():
-        part = next((each for each in separate if name.startswith(each)), None)
-        (rest if part is None else groups[part][1]).append(parameter)
-    for name, (rate, members) in groups.items():
-        if not members or rate <= 0:
-            raise ValueError(
-                f"separate must map beginnings of parameters' names to shares > 0 of the learning rate, got "
-                f"{name!r}: {rate}, which {len(members)} parameters have; look at network.named_parameters()."
-            )
-    return [(1.0, rest), *groups.values()]
-
-
-def _lay_out_like_parameters(optimizer: torch.optim.Optimizer) -> None:
-    """Gives loaded moments the strides of their parameters: fused Adam goes through the memory of both side by side.
-
-    Files hold contiguous tensors, and convolutions have their channels last.
-    """
-    for parameter, state in optimizer.state.items():
-        for name, value in state.items():
-            if isinstance(value, Tensor) and value.shape == parameter.shape:
-                state[name] = torch.empty_like(parameter).copy_(value)
+    def _begin_empty(self) -> None:
+        """Empties the memory; updates wait until it is warm again."""
+        if len(self.buffer):
+            self.buffer.empty()
+        done = math.ceil(self.updates * self.settings.frames_per_update)
+        self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)

@@ -292,8 +292,8 @@ class TestOptions:
         for level, learner in algorithm.learners.items():
             learner.store(batch)
             sample = learner.sample()
-            assert sample.shape[1] == 4 + 1  # one step for the target of the last one that is trained
-            changed, usual = learner.loss(sample), default.learners[level].loss(sample[:, :4])
+            assert sample.shape[1] == 4 + 2  # two steps for the target of the last one that is trained
+            changed, usual = learner.loss(sample), default.learners[level].loss(sample[:, : 4 + 1])
             torch.testing.assert_close(changed["q_value"], usual["q_value"])  # the same steps are trained
             assert changed["target"] != usual["target"]
 
@@ -306,58 +306,65 @@ class TestOptions:
             sample = learner.sample()
             real = sample.get(("collector", "mask"), torch.ones(sample.shape, dtype=torch.bool))
             done, ended = (sample["next", key].squeeze(-1) for key in learner_ends(learner))
-            cut = (done & ~ended)[:, :-1] & real[:, 1:]
-            everything = real.sum() - cut.sum()
+            everything = (real[:, :-1] & (ended | ~done & real.roll(-1, 1))[:, :-1]).sum()
             assert (learner.loss(sample)["trained_steps"] < everything) == burns
 
     @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
     def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):
         algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount, settings=unbounded())
         meta = algorithm.learners["meta"]
-        options = meta.extract(batch)[None, :1]
+        options = meta.extract(batch)[None, :2]
         options["next", "terminated"].fill_(False)
-        options["is_init"].fill_(True)
+        options["next", "done"].fill_(False)
+        options["is_init"].copy_(torch.tensor([[[True], [False]]]))
         options["next", "option_steps"].fill_(3)
         options["next", "option_return"].fill_(0.25)
         value_everything_at(meta, 8.0)
         assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
 
-    def test_for_the_sub_controller_a_reached_subgoal_is_the_end_and_a_time_limit_is_not(self):
+    def test_for_the_sub_controller_a_reached_subgoal_is_the_end_and_what_a_time_limit_cut_off_has_no_target(self):
         algorithm, batch = self.steps(gamma=0.5, max_option_steps=2, settings=unbounded())
         sub, after = algorithm.learners["sub"], batch["next"]
         value_everything_at(sub, 8.0)
         reached = after["subgoal_reached"] & ~after["terminated"]
         timed_out = after["option_done"] & ~after["subgoal_reached"] & ~after["terminated"]
-        for rows, following in ((reached, 0.0), (timed_out, 0.5 * 8.0)):
-            steps = sub.extract(batch)[rows.squeeze(-1)].unsqueeze(1)
-            steps["option_init"].fill_(True)
-            wanted = steps["next", "intrinsic_reward"].mean().item() + following
-            assert len(steps) and sub.loss(steps)["target"].item() == pytest.approx(wanted, abs=1e-5)
+        goes_on = ~after["option_done"]
+        steps = sub.extract(batch)
+        pairs = torch.stack([steps[:, :-1], steps[:, 1:]], 2)
+        pairs["option_init"][..., 0, :] = True
+        for rows, following in ((reached, 0.0), (goes_on, 0.5 * 8.0), (timed_out, None)):
+            chosen = pairs[rows[:, :-1].squeeze(-1)]
+            result = sub.loss(chosen)
+            assert len(chosen) and result["trained_steps"] == (0 if following is None else len(chosen))
+            if following is not None:
+                wanted = chosen["next", "intrinsic_reward"][:, 0].mean().item() + following
+                assert result["target"].item() == pytest.approx(wanted, abs=1e-5)
 
     def test_in_mid_sequence_a_time_limit_is_left_out_and_the_next_option_restarts(self):
         algorithm, batch = self.steps(max_option_steps=2)
         sub = algorithm.learners["sub"]
-        steps = sub.extract(batch)[:, :4]
-        no_end = (~steps["next", "done"][:, :3].any(1) & ~steps["next", "option_terminated"].any(1)).squeeze(-1)
-        steps = steps[no_end]  # two options of two steps each
-        assert len(steps) and steps["next", "option_done"][:, 1].all()
-        assert sub.loss(steps)["trained_steps"] == 3 * len(steps)
+        steps = sub.extract(batch)[:, :5]
+        no_end = (~steps["next", "done"][:, :4].any(1) & ~steps["next", "option_terminated"][:, :4].any(1)).squeeze(-1)
+        steps = steps[no_end]  # two options of two steps each, and the step after them
+        assert len(steps) and steps["next", "option_done"][:, [1, 3]].all()
+        assert sub.loss(steps)["trained_steps"] == 2 * len(steps)
 
     @pytest.mark.parametrize(("mask_reached", "following"), [(True, 2.0), (False, 8.0)])
     def test_a_subgoal_that_is_gone_has_no_part_in_the_meta_target(self, mask_reached, following):
         algorithm, batch = self.steps(mask_reached=mask_reached, smdp_discount=False, gamma=0.5, settings=unbounded())
         meta = algorithm.learners["meta"]
-        options = meta.extract(batch)[:, None]
-        options = options[~options["next", "terminated"].flatten()]
-        options["is_init"].fill_(True)
+        rows = meta.extract(batch)
+        options = torch.stack([rows[:-1], rows[1:]], 1)
+        options = options[~options["next", "done"][:, 0].flatten()]  # and not terminated
+        options["is_init"].copy_(torch.tensor([[True], [False]]).expand(len(options), 2, 1))
         if mask_reached:
-            options["next", "subgoal_mask"] = torch.tensor([False, True]).expand(len(options), 1, 2)
+            options["subgoal_mask"][:, 1] = torch.tensor([False, True])
         value_everything_at(meta, 5.0)
         with torch.no_grad():  # Q = V + A - mean(A): 5 + 3 and 5 - 3
             meta.loss.target_value_network_params["network", "head", "streams", "bias"][1] = 6.0
             meta.network.network.head.streams.weight.zero_()
             meta.network.network.head.streams.bias.copy_(torch.tensor([0.0, 1.0, 0.0]))  # prefers subgoal 0
-        wanted = options["next", "option_return"].mean().item() + 0.5 * following
+        wanted = options["next", "option_return"][:, 0].mean().item() + 0.5 * following
         assert meta.loss(options)["target"].item() == pytest.approx(wanted)
 
     def test_mask_reached(self):
@@ -460,11 +467,12 @@ def test_short_options_and_short_episodes_are_trained():
         meta.store(batch)
     sample = meta.sample()
     real = sample["collector", "mask"]
-    assert real.sum(-1).max() <= 4
-    starts = sample["is_init"][:, 0, 0]
+    assert real.sum(-1).max() <= 5
+    final = (sample["next", "done"] & ~sample["next", "terminated"]).squeeze(-1)
+    starts, options = sample["is_init"][:, 0, 0], real & ~final
     result = meta.loss(sample)
-    assert result["loss"] > 0
-    assert result["trained_steps"] >= real[starts].sum() > 0
+    assert result["loss"] > 0 and not final[:, 0].any()
+    assert result["trained_steps"] >= options[starts].sum() > 0
 
 
 @pytest.mark.parametrize("name", ["v2", "v3"])

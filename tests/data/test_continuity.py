@@ -83,7 +83,7 @@ class TestSeveralCollectors:
                 "batch must begin a new episode where one is over, .* without set_truncated",
             ),
             ("v2", "set_truncated", r"each end of an episode must end its option, .* Collector\(set_truncated=True\)"),
-            ("drqn", "compact_obs", "batch must hold all that environment and policy wrote, .* without compact_obs"),
+            ("v2", "compact_obs", "batch must hold all that environment and policy wrote, .* without compact_obs"),
             ("v3", "compact_obs", "batch must hold all that environment and policy wrote, .* without compact_obs"),
         ],
     )
@@ -94,6 +94,15 @@ class TestSeveralCollectors:
         with pytest.raises(ValueError, match=message):
             for batch, _ in zip(collector, range(3), strict=False):
                 algorithm.observe(batch)
+
+    def test_a_flat_agent_needs_no_observation_under_next(self):
+        env = Corridor(4, length=7)
+        algorithm = build("drqn", env)
+        collector = make_collector_of(algorithm.transform(env), algorithm, compact_obs=True)
+        for batch, _ in zip(collector, range(3), strict=False):
+            assert "observation" not in batch["next"]
+            algorithm.observe(batch)
+        assert torch.isfinite(algorithm.learners["flat"].learn()["loss"])
 
     @pytest.mark.parametrize("shape", [(2, 4, 3), (12,)])
     def test_stacked_and_flat_batches_are_refused(self, shape):

@@ -2,7 +2,7 @@ from copy import deepcopy
 
 import pytest
 import torch
-from helpers import batches_of, random_play
+from helpers import batches_of, options_of, random_play
 from tensordict import TensorDict
 
 from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector
@@ -34,12 +34,18 @@ def assert_same(options, expected):
     if not expected:
         assert options is None
         return
+    options, known = options_of(options, "observation", "subgoal_mask")
     assert options.shape == (len(expected),)
     start, end = (torch.stack(steps) for steps in zip(*expected, strict=True))
     for key in ("observation", "subgoal_mask", "is_init", ("collector", "traj_ids")):
         assert (options[key] == start[key]).all(), key
-    for key in ("observation", "subgoal_mask", "option_steps", "option_return", "done", "terminated", "truncated"):
+    for key in ("option_steps", "option_return", "terminated"):
         assert (options["next", key] == end["next", key]).all(), key
+    for key in ("observation", "subgoal_mask"):
+        assert (options["next", key] == end["next", key])[known].all(), key
+    ends = (end["next", "done"] == options["next", "done"]).squeeze(-1)
+    last = ~known & ~end["next", "terminated"].squeeze(-1)  # of an episode that was given up
+    assert (ends | last).all() and last.sum() <= 6
     assert (options["subgoal"] == end["next", "active_subgoal"]).all()
 
 
@@ -121,18 +127,22 @@ class TestEpisodesWithoutEnd:
             expected += [options for options in [whole(batch)] if options is not None]
             held = pieces.state_dict()["held"]["observation"] // 1_000
             assert held.bincount(minlength=num_envs).max() <= max_held
-        taken = torch.cat([*taken, pieces.state_dict()["held"].exclude("environment")])
-        expected = torch.cat([*expected, whole.state_dict()["held"].exclude("environment")])
+        stored = torch.cat(taken)
+        taken = torch.cat([*taken, pieces.state_dict()["held"].exclude("environment", "over")])
+        expected = torch.cat([*expected, whole.state_dict()["held"].exclude("environment", "over")])
+        final = (stored["next", "done"] & ~stored["next", "terminated"]).squeeze(-1)
+        assert final.any() or mean_episode == 6
+        taken = taken[(~taken["next", "done"] | taken["next", "terminated"]).squeeze(-1)]
         assert len(expected) > 40 * num_envs
         by_start = [options[options["observation"].argsort()] for options in (taken, expected)]
         assert (by_start[0] == by_start[1]).all()  # the same transitions
         for n in range(num_envs):
             own = taken["observation"][taken["observation"] // 1_000 == n]
             assert (own[1:] > own[:-1]).all()
-        same = taken["collector", "traj_ids"][1:] == taken["collector", "traj_ids"][:-1]
-        assert (taken["observation"][1:] == taken["next", "observation"][:-1])[
-            same
-        ].all()  # neighbours follow each other
+        went_on = (~final & ~stored["next", "terminated"].squeeze(-1)).nonzero().flatten()
+        led_to = stored["observation"][went_on] + stored["next", "option_steps"][went_on, 0]
+        assert torch.equal(stored["observation"][went_on + 1], led_to)  # at the border of two pieces, too
+        assert torch.equal(stored["collector", "traj_ids"][went_on + 1], stored["collector", "traj_ids"][went_on])
         starts = steps["observation"][steps["is_init"].squeeze(-1)]
         assert (taken["is_init"].squeeze(-1) == torch.isin(taken["observation"], starts)).all()
 
@@ -158,14 +168,14 @@ class TestEpisodesWithoutEnd:
                     extractor.load_state_dict(state)
             taken[max_held] = torch.cat(found)
         pieces, whole = taken[2], taken[10_000]
+        pieces = pieces[(~pieces["next", "done"] | pieces["next", "terminated"]).squeeze(-1)]
         pieces = pieces[torch.isin(pieces["observation"], whole["observation"])]
         pieces, whole = (options[options["observation"].argsort()] for options in (pieces, whole))
-        for part, wanted in ((pieces, whole), (pieces["next"], whole["next"])):
-            length = wanted["history_steps"]
-            assert (part["history_steps"] == length).all() and (length > 0).float().mean() > 0.8
-            assert (part["history_subgoal"] == wanted["history_subgoal"])[length.squeeze(-1) > 0].all()
-            seen = torch.arange(6) <= length
-            assert (part["history"] == wanted["history"])[seen & (length > 0)].all()
+        length = whole["history_steps"]
+        assert (pieces["history_steps"] == length).all() and (length > 0).float().mean() > 0.8
+        assert (pieces["history_subgoal"] == whole["history_subgoal"])[length.squeeze(-1) > 0].all()
+        seen = torch.arange(6) <= length
+        assert (pieces["history"] == whole["history"])[seen & (length > 0)].all()
 
     def test_other_environments_than_before_are_refused(self):
         extractor = OptionExtractor(input_keys=["observation"], mask_key=None)
@@ -184,14 +194,22 @@ class TestOptions:
         taken = [extractor(batch) for batch in batches_of(random_play(6, 102), 6)]
         return torch.cat([options for options in taken if options is not None], 0)
 
-    def test_the_end_of_an_option_is_the_start_of_the_next_and_differs_from_its_own_start(self):
-        options = self.extract()
-        same = options["collector", "traj_ids"][1:] == options["collector", "traj_ids"][:-1]
-        assert same.any()
-        for key in ("observation", "subgoal_mask"):
-            assert (options[key][1:] == options["next", key][:-1])[same].all()
-        moved = (options["observation"] != options["next", "observation"]).flatten(1).any(-1)
-        assert moved.float().mean() > 0.7  # an overwritten start would make it 0
+    def test_what_an_option_led_to_differs_from_its_start(self):
+        options, known = options_of(self.extract(), "observation")
+        moved = (options["observation"] != options["next", "observation"]).flatten(1).any(-1)[known]
+        assert known.any() and moved.float().mean() > 0.7  # an overwritten start would make it 0
+
+    def test_a_truncated_episode_ends_with_a_row_at_which_nothing_was_chosen(self):
+        rows = self.extract(state_keys=["extra"])
+        after, last = rows["next"], torch.cat([rows["collector", "traj_ids"].diff() != 0, torch.tensor([True])])
+        final = (after["done"] & ~after["terminated"]).squeeze(-1)
+        assert torch.equal(last, after["done"].squeeze(-1)) and 20 < final.sum() < last.sum()
+        assert not rows["is_init"][final].any() and not rows["extra"][final].any()
+        assert not after["option_steps"][final].any() and not after["option_return"][final].any()
+
+    def test_no_input_is_stored_twice(self):
+        rows = self.extract()
+        assert not set(rows.exclude("next").keys(True, True)) & set(rows["next"].keys(True, True))
 
     def test_episodes_come_out_whole_and_in_one_piece(self):
         options = self.extract()
@@ -213,21 +231,22 @@ class TestOptions:
     def test_only_what_is_asked_for_is_kept(self):
         options = self.extract(input_keys=["extra"], mask_key=None)
         assert set(options.keys(True, True)) == {
-            "extra", "is_init", "subgoal", ("collector", "traj_ids"), ("next", "extra"), ("next", "option_steps"),
-            ("next", "option_return"), ("next", "done"), ("next", "terminated"), ("next", "truncated"),
+            "extra", "is_init", "subgoal", ("collector", "traj_ids"), ("next", "option_steps"),
+            ("next", "option_return"), ("next", "done"), ("next", "terminated"),
         }  # fmt: skip
 
     def test_states_are_kept_from_the_start_only(self):
         extractor, batch = OptionExtractor(input_keys=["observation"], state_keys=["extra"]), random_play(3, 60)
-        options, expected = extractor(batch), PlainExtractor()(batch)
+        options, expected = options_of(extractor(batch))[0], PlainExtractor()(batch)
         assert options["extra"].tolist() == [start["extra"].item() for start, _ in expected]
         assert "extra" not in options["next"]
 
-    def test_at_end_changes_what_is_kept_from_the_end_and_nothing_else(self):
+    def test_at_end_changes_what_truncated_episodes_ended_with_and_nothing_else(self):
         plain = self.extract(input_keys=["observation"])
         changed = self.extract(at_end=lambda after: after.set("observation", after["observation"] + 1))
-        assert (changed["next", "observation"] == plain["next", "observation"] + 1).all()
-        assert (changed["observation"] == plain["observation"]).all()
+        final = (plain["next", "done"] & ~plain["next", "terminated"]).squeeze(-1)
+        assert torch.equal(changed["observation"][final], plain["observation"][final] + 1) and final.any()
+        assert torch.equal(changed["observation"][~final], plain["observation"][~final])
 
     def test_reset_forgets_options_and_episodes_in_progress(self):
         steps = random_play(6, 20)
@@ -266,11 +285,10 @@ class TestStepSelector:
         }  # fmt: skip
         assert (kept["next", "extra"] == steps["next", "extra"]).all()
 
-    def test_the_subgoal_in_force_stands_on_both_sides_of_a_step(self):
+    def test_the_subgoal_of_a_step_is_the_one_in_force(self):
         steps = random_play(4, 30)
-        kept = StepSelector(root_keys=["subgoal"], next_keys=["observation"], subgoal_key="subgoal")(steps)
-        assert (kept["subgoal"] == steps["next", "active_subgoal"]).all()
-        assert (kept["next", "subgoal"] == steps["next", "active_subgoal"]).all()
+        kept = StepSelector(root_keys=["subgoal"], next_keys=[], subgoal_key="subgoal")(steps)
+        assert (kept["subgoal"] == steps["next", "active_subgoal"]).all() and "subgoal" not in kept["next"]
         assert (kept["subgoal"] != steps["subgoal"]).any()  # random play proposes at every step
 
     def test_the_batch_is_left_as_it_was(self):
