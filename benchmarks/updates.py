@@ -229,7 +229,7 @@ def main() -> None:
         raw = raw_twin(learner, level, version)
         check_equal(learner, raw, level, version)
         times = compare(
-            lambda learner=learner: learner.update(learner.sample()),
+            lambda learner=learner: learner.learn(),
             raw.update,
             blocks=arguments.blocks,
             seconds=arguments.seconds,

@@ -215,7 +215,7 @@ def filled(precision: str, batches: int) -> Learner:
         learner.store(batch)
     collector.shutdown()
     for _ in range(20):
-        learner.update(learner.sample())
+        learner.learn()
     return learner
 
 
@@ -247,9 +247,7 @@ def main() -> None:
     learner = filled(arguments.precision, arguments.batches)
     raw = RawLearner(learner, arguments.precision)
     check_equal(learner, raw)
-    times = compare(
-        lambda: learner.update(learner.sample()), raw.update, blocks=arguments.blocks, seconds=arguments.seconds
-    )
+    times = compare(lambda: learner.learn(), raw.update, blocks=arguments.blocks, seconds=arguments.seconds)
     updates = {"updates_per_second": round(1e3 / times["ours_ms"], 1)}
     print(json.dumps({"precision": arguments.precision, "v3": times | updates}, indent=2))
 

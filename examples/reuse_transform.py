@@ -119,7 +119,7 @@ def main() -> None:
         for name, learner in learners.items():
             learner.store(batch)
             for _ in range(learner.updates_due()):
-                losses[name] = learner.update(learner.sample())["loss"].item()
+                losses[name] = learner.learn()["loss"].item()
         for exploration in explorations:
             exploration.step(batch.numel())
         if number % (batches // 5) == 0:

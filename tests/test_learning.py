@@ -37,7 +37,7 @@ def train(algorithm, env, total_frames):
         for learner in algorithm.learners.values():
             learner.store(batch)
             for _ in range(learner.updates_due()):
-                learner.update(learner.sample())
+                learner.learn()
         for exploration in algorithm.explorations.values():
             exploration.step(batch.numel())
     return evaluate(evaluation_env, algorithm.policy, episodes=200)["success_rate"], before

@@ -37,7 +37,7 @@ def play(algorithm, env, steps, decide, world=None):
 def train(learner, batch, updates):
     learner.store(batch)
     for _ in range(updates):
-        learner.update(learner.sample())
+        learner.learn()
 
 
 def largest_errors(sub):

@@ -37,12 +37,12 @@ class LevelView:
     choice_names: tuple[str, ...] = ()
 
 
-def views_of(levels: Sequence[Level], *, masked: bool = True) -> tuple[LevelView, ...]:
+def views_of(levels: Sequence[Level], *, masked: Sequence[bool] | None = None) -> tuple[LevelView, ...]:
     """The usual entries of an agent's levels.
 
     Args:
         levels: from level 0 up.
-        masked: whether subgoals that can't be chosen are left out.
+        masked: whether subgoals that can't be chosen are left out, for each level that chooses some; ``None``: yes.
 
     Examples:
         >>> from hdrqn_torchrl.algorithms.levels import make_levels
@@ -51,7 +51,8 @@ def views_of(levels: Sequence[Level], *, masked: bool = True) -> tuple[LevelView
         >>> [view.value_key for view in views_of(make_levels(4, [rooms, goals]))]
         ['action_value', 'rooms_subgoal_value', 'subgoal_value']
     """
-    return tuple(_view(level, masked) for level in levels)
+    chosen = [False, *([True] * (len(levels) - 1) if masked is None else masked)]
+    return tuple(_view(level, left_out) for level, left_out in zip(levels, chosen, strict=True))
 
 
 def _view(level: Level, masked: bool) -> LevelView:

@@ -11,7 +11,7 @@ from torchrl.data import Storage
 from torchrl.data.replay_buffers import PrioritizedSampler
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data.samplers import episode_starts, padded_slices, steps_left
+from hdrqn_torchrl.data.slices import episode_starts, padded_slices, steps_left
 
 
 class PrioritizedSequenceSampler(PrioritizedSampler):

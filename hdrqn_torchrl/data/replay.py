@@ -76,6 +76,7 @@ def make_sequence_buffer(
     priority_exponent: float | None = None,
     importance_exponent: float = 0.6,
     traj_key: NestedKey = keys.TRAJ_IDS,
+    done_key: NestedKey = ("next", keys.DONE),
     terminated_key: NestedKey | None = None,
     device: torch.device | str = "cpu",
 ) -> SequenceBuffer:
@@ -102,6 +103,7 @@ def make_sequence_buffer(
         priority_exponent, importance_exponent: draw sequences by priority, see :class:`PrioritizedSequenceSampler`;
             ``None``: all alike.
         traj_key: entry that numbers the episodes.
+        done_key: last transition of an episode; read where sequences run on, or are drawn by priority.
         terminated_key: if given, sequences do not begin with the last stored transition of an episode unless this flag
             is set: what it led to is not stored, so that there would be nothing to learn from. ``"episode_starts"``
             does not read it.
@@ -130,7 +132,7 @@ def make_sequence_buffer(
     storage = SequenceStorage(capacity, num_envs=num_envs, device=device)
     sampler: AnySampler
     if priority_exponent is None:
-        sampler = _make_sampler(sampling, slice_len, lookahead, traj_key, terminated_key)
+        sampler = _make_sampler(sampling, slice_len, lookahead, traj_key, done_key, terminated_key)
     elif sampling == "episodes":
         raise ValueError(
             "sampling must be 'steps', 'episode_starts' or 'whole_episodes' with priority_exponent, got 'episodes', "
@@ -144,6 +146,7 @@ def make_sequence_buffer(
             priority_exponent=priority_exponent,
             importance_exponent=importance_exponent,
             traj_key=traj_key,
+            done_key=done_key,
             terminated_key=terminated_key,
         )
     return SequenceBuffer(storage=storage, sampler=sampler, batch_size=batch_size * length)
@@ -173,7 +176,12 @@ def _check_capacity(
 
 
 def _make_sampler(
-    sampling: Sampling, slice_len: int, lookahead: int, traj_key: NestedKey, terminated_key: NestedKey | None
+    sampling: Sampling,
+    slice_len: int,
+    lookahead: int,
+    traj_key: NestedKey,
+    done_key: NestedKey,
+    terminated_key: NestedKey | None,
 ) -> AnySampler:
     length = slice_len + lookahead
     if sampling == "steps":
@@ -183,7 +191,7 @@ def _make_sampler(
             slice_len=length, lookahead=lookahead, traj_key=traj_key, terminated_key=terminated_key
         )
     if sampling == "episode_starts":
-        return EpisodeStartSampler(slice_len=length, traj_key=traj_key)
+        return EpisodeStartSampler(slice_len=length, traj_key=traj_key, done_key=done_key)
     if sampling == "whole_episodes":
         return WholeEpisodeSampler(slice_len=length, traj_key=traj_key, terminated_key=terminated_key)
     raise ValueError(

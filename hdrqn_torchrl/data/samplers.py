@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.data import SliceSampler, Storage
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.data.slices import episode_starts, padded_slices
 
 
 class StepSliceSampler(SliceSampler):
@@ -222,90 +223,3 @@ class EpisodeStartSampler(SliceSampler):
         init, episode, done = (steps.get(key) for key in (self.first_key, self.traj_key, self.done_key))
         starts = episode_starts(init.squeeze(-1), episode, done.squeeze(-1), storage._last_cursor_index, length)
         return starts.nonzero(as_tuple=True)  # type: ignore[return-value]
-
-
-def episode_starts(init: Tensor, episode: Tensor, done: Tensor, newest: int, length: int) -> Tensor:
-    """Which steps of a ring start an episode and are followed by ``length - 1`` steps without a gap.
-
-    Args:
-        init: first step of an episode, ``[rows, N]`` bool.
-        episode: number of the episode, ``[rows, N]``.
-        done: last step of an episode, ``[rows, N]`` bool.
-        newest: row that was written last.
-        length: steps of a slice.
-
-    Returns:
-        ``[rows, N]`` bool.
-
-    Examples:
-        >>> done = torch.tensor([[False], [True], [False], [False]])
-        >>> init, episode = done.roll(1, 0), torch.tensor([[0], [0], [1], [1]])
-        >>> episode_starts(init, episode, done, newest=3, length=2).flatten()
-        tensor([False, False,  True, False])
-    """
-    age = (newest - torch.arange(len(init), device=init.device)) % len(init)
-    starts = init & (age >= length - 1).unsqueeze(-1)
-    # Where one episode follows another that has not ended, steps between them were lost.
-    gap = ((episode != episode.roll(-1, 0)) | init.roll(-1, 0)) & ~done
-    gap[newest] = False
-    if length > 1 and gap.any():
-        spoilt = gap
-        for _ in range(length - 2):
-            spoilt = gap | spoilt.roll(-1, 0)
-        starts &= ~spoilt
-    return starts
-
-
-def steps_left(episode: Tensor, done: Tensor, newest: int) -> tuple[Tensor, Tensor]:
-    """How far each step of a ring is from the last stored step of its episode.
-
-    Args:
-        episode: number of the episode, ``[rows, N]``.
-        done: last step of an episode, ``[rows, N]`` bool.
-        newest: row that was written last.
-
-    Returns:
-        Stored steps from each step on, itself included, and whether they end with their episode, ``[rows, N]``.
-
-    Examples:
-        >>> episode, done = torch.tensor([[7], [7], [7], [5], [7]]), torch.tensor([[0], [0], [0], [1], [0]]).bool()
-        >>> left, ended = steps_left(episode, done, newest=2)
-        >>> left.flatten().tolist(), ended.flatten().tolist()
-        ([3, 2, 1, 1, 4], [False, False, False, True, False])
-    """
-    rows = len(episode)
-    age = rows - 1 - newest
-    episode, done = episode.roll(age, 0), done.roll(age, 0)  # oldest first
-    time = torch.arange(rows, device=episode.device).unsqueeze(-1)
-    is_last = episode != episode.roll(-1, 0)
-    is_last[-1] = True
-    last = torch.where(is_last, time, rows).flip(0).cummin(0).values.flip(0)
-    return (last - time + 1).roll(-age, 0), done.gather(0, last).roll(-age, 0)
-
-
-def padded_slices(
-    start: Tensor, left: Tensor, length: int, *, rows: int
-) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
-    """Slices of a ring that repeat their last real step where they end early.
-
-    Args:
-        start: place of each slice's first step: time, then environment if there are several, ``[B, ndim]``.
-        left: real steps from there on, ``[B]``.
-        length: steps of a slice.
-        rows: times that the ring holds.
-
-    Returns:
-        Indices ``[B * length]``, one tensor per dimension, and which of them are real, under
-        ``("collector", "mask")``.
-
-    Examples:
-        >>> (time,), info = padded_slices(torch.tensor([[4], [0]]), torch.tensor([3, 2]), 3, rows=6)
-        >>> time.tolist(), info["collector", "mask"].tolist()
-        ([4, 5, 0, 0, 1, 1], [True, True, True, True, True, False])
-    """
-    offset = torch.arange(length, device=start.device)
-    mask = offset < left.unsqueeze(-1)  # [B, T]
-    time = start[:, :1] + torch.minimum(offset, left.unsqueeze(-1) - 1)
-    index = [(time % rows).flatten()]
-    index += [place.repeat_interleave(length) for place in start[:, 1:].unbind(-1)]
-    return tuple(index), {keys.PAD_MASK: mask.flatten()}

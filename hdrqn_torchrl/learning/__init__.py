@@ -1,6 +1,7 @@
 """Learning: one learner for each level, its settings, and what watches over it."""
 
-from hdrqn_torchrl.learning.learner import Extract, Learner
+from hdrqn_torchrl.learning.learner import Learner
+from hdrqn_torchrl.learning.memory import Extract
 from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
 from hdrqn_torchrl.learning.phases import PhaseOne, Phases, phase_monitors
 from hdrqn_torchrl.learning.settings import LearnerSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -13,24 +13,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 
-from hdrqn_torchrl.data import FROM_STARTS, Continuity, LongerEpisodes, make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data import Continuity, sample_sequences
 from hdrqn_torchrl.learning.finite import FiniteGuard
+from hdrqn_torchrl.learning.memory import Extract, make_longer_episodes, make_memory
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision, matrix_products
 from hdrqn_torchrl.learning.settings import LearnerSettings
 from hdrqn_torchrl.learning.stored import check_counters, holds_inputs_twice
-
-
-class Extract(Protocol):
-    """Turns a collected batch ``[N, T]`` into what is stored, ``None`` if there is nothing yet."""
-
-    def __call__(self, batch: TensorDictBase) -> TensorDictBase | None: ...
-
-    def state_dict(self) -> dict[str, Any]:
-        """What it carries from batch to batch."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what ``state_dict`` returned."""
 
 
 class Learner:
@@ -82,26 +71,16 @@ class Learner:
         self.guard = FiniteGuard(at_once=self.device.type == "cpu")
         self.updates, self.frames = 0, 0
         self.optimizer = GroupedAdam(self._parameters, separate=separate or {}, learning_rate=self.learning_rate)
-        if settings.slice_len is None:
-            raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
-        lookahead = getattr(loss, "lookahead", 0)
-        self._sequence_len = settings.slice_len + lookahead
-        from_starts = settings.sampling in FROM_STARTS and (episode_len is None or episode_len > settings.slice_len)
-        self._longer = LongerEpisodes(settings.slice_len) if from_starts else None
-        self.buffer = make_sequence_buffer(
-            settings.capacity,
-            slice_len=settings.slice_len,
-            lookahead=lookahead,
-            batch_size=settings.batch_size * samples_per_draw,
+        self.buffer = make_memory(
+            settings,
+            loss,
             num_envs=num_envs,
             episode_len=episode_len,
-            sampling=settings.sampling,
-            priority_exponent=settings.priority_exponent,
-            importance_exponent=settings.importance_exponent,
-            # Where inputs are stored once, the last row of an episode has no target unless it terminated.
-            terminated_key=("next", loss.tensor_keys.terminated) if lookahead and num_envs is None else None,
+            samples_per_draw=samples_per_draw,
             device=self.device,
         )
+        self._sequence_len = (settings.slice_len or 0) + getattr(loss, "lookahead", 0)
+        self._longer = make_longer_episodes(settings, loss, num_envs=num_envs, episode_len=episode_len)
         self._continuity = Continuity()
         self._drawn: list[TensorDictBase] = []
         self.held = False

@@ -3,9 +3,10 @@
 from hdrqn_torchrl.modules.all_subgoals import AllSubgoalsPolicy
 from hdrqn_torchrl.modules.all_subgoals_network import AllSubgoalsNetwork
 from hdrqn_torchrl.modules.architectures import Architecture, compact_network, observation_predictor, paper_network
-from hdrqn_torchrl.modules.controllers import HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.modules.controllers import MetaController, SubController
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy
 from hdrqn_torchrl.modules.features import CellFeatures, CellsToImage, ConvFeatures, Features, FullyConnectedFeatures
+from hdrqn_torchrl.modules.hierarchical_policy import HierarchicalPolicy
 from hdrqn_torchrl.modules.prediction import CellDecoder, ImageDecoder, ObservationPredictor
 from hdrqn_torchrl.modules.q_network import DuelingHead, QNetwork
 from hdrqn_torchrl.modules.repeating import RepeatingEpsilonGreedy

@@ -24,7 +24,6 @@ from hdrqn_torchrl.modules.exploration import EpsilonGreedy, carried_by, choose
 from hdrqn_torchrl.modules.exploration_checks import (
     check_chooses_subgoals,
     check_condition,
-    check_two_schedules,
     exploration_or_greedy,
 )
 from hdrqn_torchrl.modules.q_network import QNetwork, State
@@ -147,14 +146,20 @@ class MetaController(TensorDictModuleBase):
     r"""Chooses the subgoal where an option starts: :math:`Q^M(\hat{o}, g)`.
 
     Elsewhere subgoal and LSTM state are kept. What it reads makes the version: the observation (v1,
-    ``in_keys=["observation"]``) or the sub-controller's state at the end of the last option (v2,
-    ``in_keys=["sub_hidden"]``, ``["sub_cell"]`` or both).
+    ``input_keys=["observation"]``) or the state of the level below at the end of the last option (v2,
+    ``input_keys=["sub_hidden"]``, ``["sub_cell"]`` or both).
+
+    Below another level that chooses subgoals, it is told which one is pursued (``condition_key``), and its state
+    restarts from zero where that level chose anew (``init_key``).
 
     Args:
-        network: Q-network over subgoals, without condition.
+        network: Q-network over subgoals, with ``num_conditions`` = number of subgoals of the level above; 0 at the top.
         exploration: epsilon-greedy choice; ``None`` is always greedy.
         input_keys: entries read, concatenated along the last dimension if several.
         mask_key: subgoals that may be chosen ``[G]`` bool; ``None``: all of them.
+        condition_key: the subgoal of the level above in force ``[]`` int64; ``None`` at the top.
+        init_key: where the state restarts ``[1]`` bool: ``option_init`` of the level above. It must be set only where
+            the gate is. ``None`` at the top.
         subgoal_key: the choice.
         gate_key: where an option starts ``[1]`` bool.
         active_subgoal_key: the subgoal to keep elsewhere.
@@ -163,7 +168,8 @@ class MetaController(TensorDictModuleBase):
         exploration_key: what the exploration carries from option to option, if anything.
 
     Raises:
-        ValueError: if ``network`` has a condition, nothing is read, or ``exploration`` repeats its choices.
+        ValueError: if ``network`` and ``condition_key`` do not fit, nothing is read, or ``exploration`` repeats its
+            choices.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -184,6 +190,8 @@ class MetaController(TensorDictModuleBase):
         *,
         input_keys: Sequence[NestedKey] = (keys.OBSERVATION,),
         mask_key: NestedKey | None = keys.SUBGOAL_MASK,
+        condition_key: NestedKey | None = None,
+        init_key: NestedKey | None = None,
         subgoal_key: NestedKey = keys.SUBGOAL,
         gate_key: NestedKey = keys.OPTION_INIT,
         active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
@@ -197,22 +205,27 @@ class MetaController(TensorDictModuleBase):
             raise ValueError(
                 f"input_keys must be a list of at least one entry, got {input_keys!r}; v1 reads ['observation']."
             )
-        if network.num_conditions:
+        if not (condition_key is None) == (init_key is None) == (network.num_conditions == 0):
             raise ValueError(
-                f"network must have no condition, got num_conditions={network.num_conditions}; a meta-controller "
-                "chooses the subgoal and is given none."
+                f"condition_key and init_key must be None exactly when the network has no condition, got "
+                f"condition_key={condition_key!r}, init_key={init_key!r} and num_conditions={network.num_conditions}; "
+                "only below another level that chooses subgoals there is one to be told."
             )
         self.network, self.exploration = network, exploration_or_greedy(exploration, "exploration")
-        check_condition(self.exploration, "exploration")
+        if condition_key is None:
+            check_condition(self.exploration, "exploration")
+        else:
+            self.exploration.set_num_subgoals(network.num_conditions)
         check_chooses_subgoals(self.exploration, "exploration")
         self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
+        self.condition_key, self.init_key = condition_key, init_key
         self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
         self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key
         self.exploration_key = exploration_key
         self.writes_values = False
         """Whether acting, too, writes its Q-values; for those who watch."""
         self.acting_keys = [gate_key, active_subgoal_key]
-        self.in_keys = [*self.input_keys, *([] if mask_key is None else [mask_key])]
+        self.in_keys = [*self.input_keys, *(key for key in (mask_key, condition_key, init_key) if key is not None)]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
         self._carried = carried_by(self.exploration, exploration_key)
         self.acting_keys += self._carried
@@ -229,75 +242,30 @@ class MetaController(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         inputs = self._inputs(tensordict)
+        condition = None if self.condition_key is None else tensordict.get(self.condition_key)
+        init = None if self.init_key is None else tensordict.get(self.init_key)
         if recurrent_mode():
             state = first_state(tensordict, self.state_keys)
-            return tensordict.set(self.action_value_key, self.network.unroll(inputs, state=state))
+            starts = None if init is None else init.squeeze(-1)
+            return tensordict.set(self.action_value_key, self.network.unroll(inputs, condition, starts, state))
         gate = tensordict.get(self.gate_key)
         if self.network.recurrent:
             state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
-            value, advanced = self.network.step(inputs, None, state)
+            if init is not None:
+                state = state[0].masked_fill(init, 0.0), state[1].masked_fill(init, 0.0)
+            value, advanced = self.network.step(inputs, condition, state)
             for key, new, old in zip((self.hidden_key, self.cell_key), advanced, state, strict=True):
                 tensordict.set(_next(key), torch.where(gate, new, old))
         else:
-            value = self.network.evaluate(inputs)
+            value = self.network.evaluate(inputs, condition)
         mask = None if self.mask_key is None else tensordict.get(self.mask_key)
         if self.writes_values:
             tensordict.set(self.action_value_key, value)
         due = gate.squeeze(-1)
-        chosen = choose(self.exploration, value, tensordict, self.exploration_key, mask=mask, due=due)
+        chosen = choose(
+            self.exploration, value, tensordict, self.exploration_key, mask=mask, condition=condition, due=due
+        )
         return tensordict.set(self.subgoal_key, torch.where(due, chosen, tensordict.get(self.active_subgoal_key)))
-
-
-class HierarchicalPolicy(TensorDictModuleBase):
-    """Meta-controller, then sub-controller: one decision of the whole agent.
-
-    Args:
-        meta_controller: writes the subgoal.
-        sub_controller: reads it and writes the action.
-        read_last_observation: before a new option, advance the sub-controller's state by the observation in
-            which the last one ended, so that v2's meta-controller reads it, too. ``False`` is Algorithm 1 as
-            written: the state after the last decision.
-        init_key: first step of an episode ``[1]`` bool; read if ``read_last_observation``.
-
-    Raises:
-        ValueError: if the two do not fit each other, share an exploration, or there is no state to advance.
-    """
-
-    def __init__(
-        self,
-        meta_controller: MetaController,
-        sub_controller: SubController,
-        *,
-        read_last_observation: bool = False,
-        init_key: NestedKey = keys.IS_INIT,
-    ) -> None:
-        super().__init__()
-        chosen, known = meta_controller.network.num_actions, sub_controller.network.num_conditions
-        if chosen != known:
-            raise ValueError(
-                f"sub_controller must have as many conditions as the meta_controller has subgoals, got {known} and "
-                f"{chosen}; build its network with num_conditions={chosen}."
-            )
-        check_two_schedules(sub_controller.exploration, meta_controller.exploration)
-        if read_last_observation and not sub_controller.network.recurrent:
-            raise ValueError("read_last_observation must be False without recurrence: the sub_controller has no state.")
-        self.meta_controller, self.sub_controller = meta_controller, sub_controller
-        self.read_last_observation, self.init_key = read_last_observation, init_key
-        made = [key for key in meta_controller.out_keys if key in sub_controller.in_keys]
-        wanted = [*meta_controller.acting_keys, *meta_controller.in_keys, *sub_controller.in_keys]
-        if read_last_observation:
-            wanted.append(init_key)
-        self.in_keys = list(dict.fromkeys(key for key in wanted if key not in made))
-        self.out_keys = [*meta_controller.out_keys, *sub_controller.out_keys]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self.read_last_observation:
-            meta, sub = self.meta_controller, self.sub_controller
-            ended = tensordict.get(meta.gate_key) & ~tensordict.get(self.init_key)
-            advanced = sub.advance(tensordict, meta.active_subgoal_key)
-            for key, value in zip((sub.hidden_key, sub.cell_key), advanced, strict=True):
-                tensordict.set(key, torch.where(ended, value, tensordict.get(key)))
-        return self.sub_controller(self.meta_controller(tensordict))
 
 
 def first_state(tensordict: TensorDictBase, state_keys: Sequence[NestedKey]) -> State | None:

@@ -136,7 +136,7 @@ class Trainer:
             with _naming(name):
                 for _ in range(learner.updates_due()):
                     self._stop.check()
-                    self._window.add_update(name, learner.update(learner.sample()))
+                    self._window.add_update(name, learner.learn())
                 learner.check_finite()
         self.collector.update_policy_weights_()
         before, best = self._completed, False

@@ -57,7 +57,7 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
     for learner in algorithm.learners.values():
         before = [p.detach().clone() for p in learner.network.parameters()]
         learner.store(batch)
-        metrics = learner.update(learner.sample())
+        metrics = learner.learn()
         assert metrics["loss"] > 0 and metrics["trained_steps"] > 0
         assert any((p != old).any() for p, old in zip(learner.network.parameters(), before, strict=True))
 
@@ -160,9 +160,9 @@ class TestBoundsOfTargets:
         for batch in collect(algorithm, env, 16, 4):
             learner.store(batch)
         for _ in range(300):
-            learner.update(learner.sample())
+            learner.learn()
         value = "meta_q_value" if name == "v3" else "q_value"
-        assert learner.update(learner.sample())[value] > 4.0
+        assert learner.learn()[value] > 4.0
 
     def test_what_a_user_s_environment_states_bounds_its_agents(self):
         task = Task(largest_return=40.0, largest_extrinsic_return=20.0, smallest_extrinsic_return=-5.0)
@@ -538,7 +538,7 @@ class TestSequences:
         learner = algorithm.learners["meta" if level == "meta" else next(iter(algorithm.learners))]
         for batch in played(make):
             learner.store(batch)
-        metrics = learner.update(learner.sample())
+        metrics = learner.learn()
         assert metrics["trained_steps"] > 0 and all(torch.isfinite(value) for value in metrics.values())
         sample = learner.sample()
         assert sample["is_init"][:, 0].all() if settings.sampling in FROM_STARTS else len(sample) == 16
@@ -598,7 +598,7 @@ class TestV3:
         learner, network = algorithm.learners["joint"], algorithm.policy.network
         learner.store(batch)
         before = {name: p.detach().clone() for name, p in network.named_parameters()}
-        metrics = learner.update(learner.sample())
+        metrics = learner.learn()
         target = learner.loss.target_policy_params["network"].flatten_keys(".")
         for name, parameter in network.named_parameters():
             moved = (parameter - before[name]).abs().max().item()
@@ -749,13 +749,13 @@ class TestV3:
         first.store(batch[:, :20])
         second.store(batch[:, 20:])
         for learner in (first, second):
-            learner.update(learner.sample())
+            learner.learn()
         second.load_state_dict(deepcopy(first.state_dict()))  # torch's optimiser keeps what it is given
         for learner in (first, second):
             torch.manual_seed(1)
             learner.store(batch[:, 20:])
             for _ in range(2):
-                learner.update(learner.sample())
+                learner.learn()
         assert parameter_distance(first.loss.policy_params.data, second.loss.policy_params.data) == 0
         assert parameter_distance(first.loss.target_policy_params, second.loss.target_policy_params) == 0
 
@@ -779,7 +779,7 @@ class TestRepeatedActions:
         assert (action[:, 1:] == action[:, :-1])[goes_on].all()
         for learner in algorithm.learners.values():
             learner.store(steps)
-        assert torch.isfinite(learner.update(learner.sample())["loss"])
+        assert torch.isfinite(learner.learn()["loss"])
 
     @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
     def test_nor_over_options(self, name):

@@ -122,7 +122,7 @@ class TestObservations:
         algorithm = build(name, env)
         algorithm.observe(collect(algorithm, env, 16)[0])
         for learner in algorithm.learners.values():
-            assert torch.isfinite(learner.update(learner.sample())["loss"])
+            assert torch.isfinite(learner.learn()["loss"])
 
     def test_an_architecture_of_one_s_own_reads_what_it_wants(self):
         env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
@@ -162,7 +162,7 @@ class TestGymnasium:
             assert (batch["next", "attained"].any(-1, keepdim=True) == (batch["next", "extrinsic_reward"] == 1)).all()
             assert batch["next", "attained"].any() and batch["next", "option_done"][batch["next", "done"]].all()
         for learner in algorithm.learners.values():
-            assert torch.isfinite(learner.update(learner.sample())["loss"])
+            assert torch.isfinite(learner.learn()["loss"])
 
     def test_vectors_that_reset_themselves_in_the_same_step_are_for_plain_observations(self):
         message = refusal("v2", self.walks("SAME_STEP"))
@@ -238,7 +238,7 @@ def test_agents_learn_without_what_not_every_task_has(name, options, without):
     for batch in collect(algorithm, env, 8, 2):
         algorithm.observe(batch)
     for learner in algorithm.learners.values():
-        assert torch.isfinite(learner.update(learner.sample())["loss"])
+        assert torch.isfinite(learner.learn()["loss"])
 
 
 @pytest.mark.parametrize("name", EVERY)

@@ -165,7 +165,7 @@ class TestTimeLimits:
             if name in HIERARCHICAL:
                 assert after["option_done"][after["done"]].all() and after["done"].any()
         for learner in algorithm.learners.values():
-            assert torch.isfinite(learner.update(learner.sample())["loss"])
+            assert torch.isfinite(learner.learn()["loss"])
 
     @pytest.mark.parametrize("name", ["dqn", "drqn"])
     def test_flat_agents_take_one_anywhere(self, name):

@@ -37,9 +37,7 @@ def sequence(*, pursued, attained, init, done, terminated="", episode_done="", m
     after.update(
         {"terminated": at(episode_done) & at(terminated), "intrinsic_reward": torch.tensor(reward)[None, :, None]}
     )
-    sample = TensorDict(
-        subgoal=subgoal, option_init=at(init), subgoal_mask=flags(mask)[None], batch_size=[1, time]
-    )
+    sample = TensorDict(subgoal=subgoal, option_init=at(init), subgoal_mask=flags(mask)[None], batch_size=[1, time])
     sample["extra"] = torch.arange(time)[None]
     return sample.set("next", after)
 

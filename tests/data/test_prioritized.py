@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
-from hdrqn_torchrl.data.samplers import steps_left
+from hdrqn_torchrl.data.slices import steps_left
 from hdrqn_torchrl.runs.serialization import SafetensorsAdapter
 
 SAMPLINGS = ["steps", "episode_starts", "whole_episodes"]

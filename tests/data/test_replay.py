@@ -6,7 +6,7 @@ from streams import Stream, check_sequences, one_episode
 from torchrl.data import SliceSampler
 
 from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
-from hdrqn_torchrl.data.samplers import episode_starts
+from hdrqn_torchrl.data.slices import episode_starts
 
 PADDED = ["steps", "episodes", "whole_episodes"]
 

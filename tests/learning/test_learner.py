@@ -74,7 +74,7 @@ class TestUpdatesDue:
             learner.store(make_batch())
             made.append(learner.updates_due())
             for _ in range(made[-1]):
-                learner.update(learner.sample())
+                learner.learn()
         assert made == [0, 1, 1, 0, 1, 1] and learner.updates == 4 and learner.frames == 96
 
     def test_the_count_begins_with_the_first_transition(self):
@@ -109,7 +109,7 @@ class TestWhatCanNotBeDrawnYet:
             learner.store(steps[:, start : start + 2])
             found.append(learner.updates_due())
             for _ in range(found[-1]):
-                learner.update(learner.sample())
+                learner.learn()
         assert found == due
 
     def test_a_memory_that_loses_its_last_start_waits_says_so_once_and_goes_on(self):
@@ -126,7 +126,7 @@ class TestWhatCanNotBeDrawnYet:
                 learner.store(steps[:, start : start + 1])
                 found.append(learner.updates_due())
                 for _ in range(found[-1]):
-                    learner.update(learner.sample())
+                    learner.learn()
         assert found == [0 if time % 8 in (6, 7) else 1 for time in range(24)]
         said = [str(each.message) for each in caught if "capacity should be so large" in str(each.message)]
         assert len(said) == 1 and "a sequence of 3 transitions" in said[0] and "got 12; nothing is learned" in said[0]
@@ -143,7 +143,7 @@ class TestWhatCanNotBeDrawnYet:
             learner.store(make_batch())
             found.append(learner.updates_due())
             for _ in range(found[-1]):
-                learner.update(learner.sample())
+                learner.learn()
         assert found == [2, 0, 0, 2, 2]
 
 
@@ -193,7 +193,7 @@ class TestUpdate:
         learner.store(make_batch())
         before = learner.loss.value_network_params.data.clone()
         assert parameter_distance(before, learner.loss.target_value_network_params) == 0
-        metrics = learner.update(learner.sample())
+        metrics = learner.learn()
         after, target = learner.loss.value_network_params.data, learner.loss.target_value_network_params.data
         assert parameter_distance(before, after) > 0
         assert parameter_distance(before * 0.75 + after * 0.25, target) < 1e-6
@@ -569,7 +569,7 @@ class TestState:
             losses.append([])
             for batch in batches[3:]:
                 for _ in range(learner.updates_due()):
-                    losses[-1].append(learner.update(learner.sample())["loss"].item())
+                    losses[-1].append(learner.learn()["loss"].item())
                 learner.store(batch)
         assert losses[0] == losses[1] and len(losses[0]) == 13
         for params in ("value_network_params", "target_value_network_params"):
@@ -641,7 +641,7 @@ class TestNumbersThatAreNone:
     def poisoned(self, **settings):
         learner = make_learner(**settings)
         learner.store(make_batch())
-        learner.update(learner.sample())
+        learner.learn()
         return learner, learner.sample()
 
     def check_nothing_was_learned(self, learner, sample, message):
@@ -726,7 +726,7 @@ class TestNumbersThatAreNoneOnAGPU:
         learner = make_learner(max_grad_norm=1.0, learning_rate=0.1)
         learner.guard.at_once = False
         learner.store(make_batch())
-        learner.update(learner.sample())
+        learner.learn()
         sample = learner.sample()
         sample["next", "reward"].fill_(float("nan"))
         return learner, sample
@@ -745,7 +745,7 @@ class TestNumbersThatAreNoneOnAGPU:
     def test_the_host_hears_of_it(self, look):
         learner, sample = self.poisoned()
         learner.update(sample)
-        learner.update(learner.sample())
+        learner.learn()
         arguments = [make_batch()] if look == "store" else []
         with pytest.raises(NonFiniteError, match=r"^the loss became nan in update 2, frame 16$"):
             getattr(learner, look)(*arguments)

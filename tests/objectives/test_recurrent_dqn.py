@@ -697,12 +697,12 @@ class TestPrediction:
             with torch.no_grad():
                 inputs = loss._take_apart(sample).inputs
                 memory = loss._action_values(inputs)[2]
-                errors = network.predictor(memory, sample["action"], inputs["observation"], steps=ahead)
+                errors = network.predictor(memory, sample["action"][:, :-1], inputs["observation"], steps=ahead)
             kept = [
                 errors[b, t].item()
                 for b in range(rows)
-                for t in range(steps + 1 - ahead)
-                if valid[b, t : t + ahead].all() and not done[b, t : t + ahead].any()
+                for t in range(steps - ahead)
+                if valid[b, t : t + ahead + 1].all() and not done[b, t : t + ahead].any()
             ]
             padded += errors.numel() - len(kept)
             assert result["prediction_loss"].item() == pytest.approx(sum(kept) / len(kept), rel=1e-4)

@@ -18,7 +18,7 @@ def train_a_little(algorithm, env):
             learner.store(batch)
     for learner in algorithm.learners.values():
         for _ in range(3):
-            learner.update(learner.sample())
+            learner.learn()
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)

@@ -69,7 +69,7 @@ def test_agents_learn_on_an_environment_whose_subgoals_come_from_a_critic_only(n
         legs.observe(batch)
         for learner in agent.learners.values():
             for _ in range(learner.updates_due()):
-                assert torch.isfinite(learner.update(learner.sample())["loss"])
+                assert torch.isfinite(learner.learn()["loss"])
     assert all(learner.updates for learner in agent.learners.values())
     attained = batch["next", "attained"]
     reached = attained.gather(-1, batch["next", "active_subgoal"].unsqueeze(-1))
