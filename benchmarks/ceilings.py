@@ -1,8 +1,9 @@
-"""Measures the scripted players on the paper's tasks and prints the rows of ``MEASURED`` in envs/ceilings.py."""
+"""Measures the scripted players on the paper's tasks and prints the rows of ``MEASURED`` in envs/grid/measured.py."""
 
 import torch
 
-from hdrqn_torchrl.envs.grid.ceilings import MEASURED_EPISODES, measure, standard_tasks
+from hdrqn_torchrl.envs.grid.ceilings import measure, standard_tasks
+from hdrqn_torchrl.envs.grid.measured import MEASURED_EPISODES
 
 if __name__ == "__main__":
     torch.set_num_threads(1)

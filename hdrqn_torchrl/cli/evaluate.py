@@ -15,20 +15,20 @@
     out             file to write the object to as well
     figures         folder for pictures: how often options lead from one subgoal to another (legs.png) and, where
                     there is a screen, where the agent was (places.png)
-    ceilings        what scripted players achieve (true); where nobody has measured it they play, minutes on large maps
+    ceilings        what scripted players achieve (true); where nobody has measured it they play, ...
+    ceiling_seconds ... each for so long at most (the run's evaluation.ceiling_seconds)
     allowed_targets own builders that the run's settings may name, e.g. [my_package.MyEnv]
 
 Each figure is a mean over episodes. "intervals" are 95 % intervals over the episodes of this one agent (t; of rates
 Clopper and Pearson's; null where all episodes were alike): they do not say how agents of other seeds would do.
-"references" are what scripted players achieve on the same task ("memory" has the agent's own view: the ceiling;
-"egocentric" must also find out where it is).
+"references" are what scripted players achieve on the same task, if it has any, and "ceiling" is the return of one of
+them (on the grids: "memory", which has the agent's own view; "egocentric" must also find out where it is).
 """
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -60,6 +60,7 @@ class Settings:
     out: str | None = None
     figures: str | None = None
     ceilings: bool = True
+    ceiling_seconds: float | None = None
     threads: int = 1
     allowed_targets: list[str] = field(default_factory=list)
 
@@ -95,9 +96,10 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
     from torchrl.envs import ExplorationType
 
     from hdrqn_torchrl.analysis.episodes import summarise
+    from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.runs import load_agent
     from hdrqn_torchrl.runs.evaluation import play
-    from hdrqn_torchrl.runs.folder import ceiling_of, references_for
+    from hdrqn_torchrl.runs.references import ceiling_of, references_for
 
     torch.set_num_threads(settings.threads)
     agent = load_agent(
@@ -124,7 +126,9 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
         )
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    references = references_for(agent.env.base_env, tell=tell) if settings.ceilings else {}
+    task = task_of(agent.env.base_env)
+    seconds = settings.ceiling_seconds or agent.config.evaluation.ceiling_seconds
+    references = references_for(task, seconds=seconds, tell=tell) if settings.ceilings else {}
     result = {
         "run": settings.run,
         "checkpoint": settings.checkpoint,
@@ -133,7 +137,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
         "epsilon": settings.epsilon,
         **summarise(played),
         **({"legs": legs_of(observers["legs"])} if "legs" in observers else {}),
-        "ceiling": ceiling_of(references),
+        "ceiling": ceiling_of(references, task),
         "references": references,
     }
     return result, agent, observers
@@ -147,16 +151,16 @@ def tell(sentence: str) -> None:
 def observers_of(env: EnvBase) -> dict[str, Any]:
     """What counts legs (of hierarchical agents) and places (where there is a screen)."""
     from hdrqn_torchrl import keys
-    from hdrqn_torchrl.envs import MontezumaEnv
+    from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.learning.legs import LegCounter
     from hdrqn_torchrl.runs.evaluation import PlaceCounter
 
-    spec, base = env.observation_spec, env.base_env
+    spec, screen = env.observation_spec, task_of(env.base_env).screen
     observers: dict[str, Any] = {}
     if spec.get(keys.OPTION_INIT, None) is not None:
         observers["legs"] = LegCounter(spec[keys.ATTAINED].shape[-1])
-    if spec.get(keys.POSITION, None) is not None and isinstance(base, MontezumaEnv):
-        observers["places"] = PlaceCounter(*base.emulators.screens.shape[1:3])
+    if spec.get(keys.POSITION, None) is not None and screen is not None:
+        observers["places"] = PlaceCounter(*screen(env.base_env).shape[:2])
     return observers
 
 
@@ -165,26 +169,19 @@ def legs_of(legs: LegCounter) -> dict[str, list]:
     return {"options": legs.options.tolist(), "reached": legs.reached.tolist()}
 
 
-def names_of_subgoals(base: EnvBase, number: int) -> Sequence[str]:
-    """As pictures have them; numbers for tasks that have none."""
-    from hdrqn_torchrl.rendering import scene_of
-
-    try:
-        return scene_of(base).subgoal_names
-    except ValueError:
-        return [f"subgoal {index}" for index in range(number)]
-
-
 def draw(observers: dict[str, Any], base: EnvBase, folder: Path) -> None:
     """Writes the pictures."""
     from hdrqn_torchrl.analysis.figures import plot_legs, plot_places
+    from hdrqn_torchrl.envs import task_of
+    from hdrqn_torchrl.rendering import scene_of
 
     if "legs" in observers:
         legs = observers["legs"]
-        names = names_of_subgoals(base, legs.num_subgoals)
+        names = scene_of(base).subgoal_names
         plot_legs(legs.options.numpy(), legs.reached.numpy(), names, folder / "legs.png")
-    if "places" in observers:
-        plot_places(observers["places"].counts.numpy(), base.emulators.start.screen, folder / "places.png")
+    screen = task_of(base).screen
+    if "places" in observers and screen is not None:
+        plot_places(observers["places"].counts.numpy(), screen(base), folder / "places.png")
 
 
 def main() -> None:

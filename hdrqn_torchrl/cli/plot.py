@@ -18,8 +18,8 @@ center    mean (default) or iqm, the interquartile mean; either with a 95 % t in
           where it would make a panel more than twice as high
 smooth    moving average over so many log points, or over this share of a run if < 1 (default 0: none)
 pool      true: all tasks in one row of panels; intervals are of seeds, not of tasks (default: a row for each task)
-ceilings  known (default): scripted players where they have been measured; simulate: play the others, which takes
-          seconds for each task; none
+ceilings  known (default): scripted players where they have been measured; simulate: the others play, each for two
+          minutes at most; none
 log_x     true: logarithmic axis
 title     heading
 
@@ -54,9 +54,10 @@ from hdrqn_torchrl.analysis.results import (
     source_of,
 )
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.arguments import TARGET, SettingsError
 from hdrqn_torchrl.runs.reading import read_choices
 from hdrqn_torchrl.runs.stored_settings import read_settings
+from hdrqn_torchrl.runs.trust import BUILDERS
 
 ALLOWED = {
     "kind": ("curves", "greedy", "bars"),
@@ -65,7 +66,6 @@ ALLOWED = {
     "ceilings": ("known", "simulate", "none"),
 }
 ENDINGS = (".png", ".svg", ".pdf", ".csv")
-GRID_TASK = "hdrqn_torchrl.envs.MultiGoalGridEnv"
 BROKEN = (ValueError, TypeError, KeyError, OSError)
 
 
@@ -237,25 +237,27 @@ def references_of(entry: Entry, ceilings: str) -> References:
     """Scripted players' results on a run's task; where they are not known, the ceiling that the run has logged."""
     if ceilings == "none":
         return {}
-    task = task_of(entry)
-    if task.pop("_target_", "") == GRID_TASK and (known := players(json.dumps(task), simulate=ceilings == "simulate")):
-        return known
+    if found := players(json.dumps(task_of(entry)), simulate=ceilings == "simulate"):
+        return found
     _, logged = curve(entry.run, "greedy/ceiling")
     return {"memory": {"return_mean": float(logged[-1])}} if len(logged) else {}
 
 
 @lru_cache
-def players(task: str, *, simulate: bool) -> References:
-    """What the scripted players achieve on a grid task, given as JSON; empty if that is not known."""
-    from hdrqn_torchrl.envs import MultiGoalGridEnv, ceiling  # takes seconds: it loads torch
-    from hdrqn_torchrl.envs.grid.scripted import PLAYERS
-
-    episodes = 1000 if simulate else 0  # no episodes are refused for tasks that have not been measured
-    try:
-        env = MultiGoalGridEnv(1, **json.loads(task))
-        return {player: ceiling(player, env, episodes=episodes) for player in PLAYERS}
-    except (TypeError, ValueError):  # not measured, or settings of another version
+def players(settings: str, *, simulate: bool) -> References:
+    """What the scripted players achieve on a task, given as JSON; empty if that is not known."""
+    task = json.loads(settings)
+    if task.get(TARGET) not in BUILDERS["env"]:  # one's own: nobody has said that it can be trusted
         return {}
+    from hdrqn_torchrl.envs import task_of as stated_by  # takes seconds: it loads torch
+    from hdrqn_torchrl.runs.building import build
+    from hdrqn_torchrl.runs.references import references_for
+
+    try:
+        env = build(task | {"num_envs": 1}, place="env")
+    except SettingsError:  # what it needs is not installed, or another version's
+        return {}
+    return references_for(stated_by(env), play=simulate, tell=note)
 
 
 def write(tasks: list[TaskResults], panels: list[Panel], out: list[Path], settings: Settings) -> None:

@@ -28,7 +28,15 @@ from hdrqn_torchrl.runs.reading import read_choices, read_config
 from hdrqn_torchrl.runs.settings import RunSettings, Settings, as_plain, check, settings_of
 from hdrqn_torchrl.runs.stored_settings import INTERPOLATION
 
-FREE = ("resume", "resume_override", "checkpoint", "output_root", "allowed_targets", "evaluation.ceilings")
+FREE = (
+    "resume",
+    "resume_override",
+    "checkpoint",
+    "output_root",
+    "allowed_targets",
+    "evaluation.ceilings",
+    "evaluation.ceiling_seconds",
+)
 """Settings that may differ when a run is resumed: they don't change what is learned."""
 FOLLOWS = "learning_rate_frames"
 """Settings of this name that are equal to ``total_frames`` are raised with it."""

@@ -28,6 +28,7 @@ from hdrqn_torchrl.runs.settings import check, pick_device
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
+    from hdrqn_torchrl.runs.references import Players
     from hdrqn_torchrl.runs.trainer import Trainer
 
 
@@ -72,10 +73,10 @@ def train(run: Plan) -> float:
     with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
         refused = (ValueError, CheckpointError) if run.resumed else ()
         with noting_errors(run, unless=refused):
-            trainer, evaluation_env, references = begin(run)
+            trainer, evaluation_env, players = begin(run)
         with noting_errors(run):
             trainer.train()
-            return write_summary(run, trainer, evaluation_env, references)["return_mean"]
+            return write_summary(run, trainer, evaluation_env, players)["return_mean"]
 
 
 @contextlib.contextmanager
@@ -127,7 +128,7 @@ def note_error(folder: Path) -> None:
         write_whole(folder / "error.txt", traceback.format_exc())
 
 
-def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
+def begin(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
@@ -140,7 +141,7 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     stale = [*run.folder.glob("*.partial*"), *([run.folder / "metrics.csv"] if start is None else [])]
     for path in stale:
         remove(path)
-    trainer, evaluation_env, references = build_run(run)
+    trainer, evaluation_env, players = build_run(run)
     if start is not None:
         trainer.resume(start)
     elif run.config.init_from is not None:
@@ -151,18 +152,16 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, dict]:
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
     for name in ("error.txt", "summary.json", "curves.png"):
         remove(run.folder / name)
-    return trainer, evaluation_env, references
+    return trainer, evaluation_env, players
 
 
-def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, references: dict) -> dict[str, Any]:
+def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players: Players) -> dict[str, Any]:
     """Final greedy evaluation; writes and prints the run's results."""
     from hdrqn_torchrl.analysis.plotting import plot_run
     from hdrqn_torchrl.analysis.results import read_metrics
     from hdrqn_torchrl.runs import folder
     from hdrqn_torchrl.runs.evaluation import evaluate
 
-    if references:  # the others come last: training need not wait for them
-        references = folder.references_for(evaluation_env.base_env, tell=tell_of_player)
     result = evaluate(
         evaluation_env,
         trainer.algorithm.policy,
@@ -172,24 +171,26 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, referenc
     )
     groups = (f"{name}={run.choices[name]}" for name in ("env", "algo", "network") if name in run.choices)
     title = " ".join([*groups, f"seed={run.config.seed}"])
-    summary = folder.write_summary(run.folder, trainer, result, references=references)
+    references = players()  # only now all of them: training need not wait
+    summary = folder.write_summary(run.folder, trainer, result, ceiling=trainer.ceiling())
     with replaced(run.folder / "curves.png") as picture:
         plot_run(read_metrics(run.folder / "metrics.csv"), picture, title=title, references=references)
     print(json.dumps({"run": str(run.folder), **summary}))
     return summary
 
 
-def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
-    """Everything that a run needs: trainer, evaluation environment, scripted references."""
+def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
+    """Everything that a run needs: trainer, evaluation environment, and what finds the scripted players' figures."""
     import numpy
     import torch
 
+    from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.envs.specs import interface_differences
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.collectors import ResumableCollector
     from hdrqn_torchrl.runs.evaluation import evaluate
-    from hdrqn_torchrl.runs.folder import ceiling_of, references_for
     from hdrqn_torchrl.runs.logging import RunLogger
+    from hdrqn_torchrl.runs.references import Players
     from hdrqn_torchrl.runs.trainer import Trainer
 
     config = run.config
@@ -207,8 +208,9 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
             f"{config.evaluation.env}: {found}; set env.KEY for both."
         )
     evaluation_env = algorithm.transform(evaluation_base)
-    references = (
-        references_for(evaluation_env.base_env, ["memory"], tell=tell_of_player) if config.evaluation.ceilings else {}
+    chosen = config.evaluation
+    players = Players(
+        task_of(evaluation_base), play=chosen.ceilings, seconds=chosen.ceiling_seconds, tell=tell_of_player
     )
     frames_per_batch = env.batch_size[0] * config.steps_per_batch
     collector = ResumableCollector(
@@ -246,6 +248,6 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, dict]:
         ),
         checkpoint_frames=config.checkpoint.interval_frames,
         checkpoint_seconds=60.0 * config.checkpoint.interval_minutes,
-        ceiling=ceiling_of(references),
+        ceiling=players.ceiling,
     )
-    return trainer, evaluation_env, references
+    return trainer, evaluation_env, players

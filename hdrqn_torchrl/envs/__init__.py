@@ -10,16 +10,17 @@ from hdrqn_torchrl.envs.grid.scripted import (
     play_episodes,
     scripted_ceiling,
 )
-from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv, make_montezuma
-from hdrqn_torchrl.envs.task import GoalsInOrder, SubgoalSet, Task, task_of
+from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv
+from hdrqn_torchrl.envs.montezuma.making import make_montezuma
+from hdrqn_torchrl.envs.task import Reference, SubgoalSet, Task, task_of
 
 __all__ = [
     "EgocentricSearch",
     "FullInformationPlanner",
-    "GoalsInOrder",
     "MontezumaEnv",
     "MultiGoalGridEnv",
     "PerfectMemorySearch",
+    "Reference",
     "SubgoalSet",
     "Task",
     "UniformRandom",

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol
 
-from tensordict import TensorDictBase
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+from tensordict import NestedKey
 from torch.nn import Module
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
@@ -16,7 +18,18 @@ from torchrl.envs.transforms import StepCounter, TransformedEnv
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
 
-InOrder = Callable[[TensorDictBase], Tensor]
+if TYPE_CHECKING:
+    from hdrqn_torchrl.envs.scene import Scene  # whose pictures take a second to load
+
+Figures = Mapping[str, float]
+
+
+class SceneFactory(Protocol):
+    """Makes a scene of the present moment of an environment with one world."""
+
+    def __call__(self, env: EnvBase, *, subgoal: int | None = None, action: int | None = None) -> Scene:
+        """See :func:`~hdrqn_torchrl.rendering.scene_of`."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +70,31 @@ class SubgoalSet:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Reference:
+    """A scripted player that marks what can be achieved on a task. It plays only when somebody asks.
+
+    Figures are means over episodes: ``return_mean`` and, as far as there are any, ``success_rate``, ``steps_mean`` and
+    ``episodes``.
+
+    Args:
+        what: it knows, in a few words.
+        play: plays and returns the figures; takes the seconds it may need (``None``: as many as it needs), and raises
+            ``TimeoutError`` if they are not enough.
+        known: figures that were measured earlier.
+        key: names player and task: the same key, the same figures. They are then kept on disk; empty: they are not.
+
+    Examples:
+        >>> Reference(what="chance", play=lambda seconds: {"return_mean": 0.5}).play(None)
+        {'return_mean': 0.5}
+    """
+
+    what: str
+    play: Callable[[float | None], Figures]
+    known: Figures | None = None
+    key: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Task:
     """What an environment says about its task, in an attribute ``task``. What it leaves out is unknown.
 
@@ -67,13 +105,21 @@ class Task:
         largest_return: largest return there can be of ``reward``.
         largest_extrinsic_return: largest return there can be of ``extrinsic_reward``.
         smallest_extrinsic_return: smallest one; 0 where that reward is never negative.
-        in_order: for tasks whose subgoals have an order: from what the environment wrote after a step ``[N]``, the
-            share of all subgoals that the step reached in the proper order ``[N]``; ``None``: they have none.
         subgoals: sets of subgoals, from near to far; an agent of L levels pursues the last L - 1 of them. None: it is
             known only that there is one set, of as many as ``attained`` has.
+        ordered: whether the farthest subgoals are to be attained one after the other, as they are numbered. Then the
+            share of them that were is counted, as ``in_order``.
+        success: entry that tells whether a step completed the whole task, if the environment writes it.
+        actions: names of the actions.
+        references: scripted players by name.
+        ceiling: name of the one that learning curves are drawn against.
+        scene: makes a picture of the present moment; ``None``: what the environment's ``render`` returns or, failing
+            that, text.
+        screen: a picture ``[height, width, 3]`` of where an episode begins, for environments whose entry ``position``
+            tells where on it the agent is.
 
     Raises:
-        ValueError: if a number breaks its rule.
+        ValueError: if a number breaks its rule, or the ceiling is none of the references.
 
     Examples:
         >>> Task(max_steps=50, largest_return=2.0).largest_return
@@ -84,8 +130,14 @@ class Task:
     largest_return: float = math.inf
     largest_extrinsic_return: float = math.inf
     smallest_extrinsic_return: float = -math.inf
-    in_order: InOrder | None = None
     subgoals: tuple[SubgoalSet, ...] = ()
+    ordered: bool = False
+    success: NestedKey = keys.SUCCESS
+    actions: tuple[str, ...] = ()
+    references: Mapping[str, Reference] = field(default_factory=dict)
+    ceiling: str | None = None
+    scene: SceneFactory | None = None
+    screen: Callable[[EnvBase], NDArray[np.uint8]] | None = None
 
     def __post_init__(self) -> None:
         if self.max_steps is not None and self.max_steps < 1:
@@ -95,11 +147,18 @@ class Task:
                 f"smallest_extrinsic_return must be <= largest_extrinsic_return={self.largest_extrinsic_return}, got "
                 f"{self.smallest_extrinsic_return}; leave out what is not known."
             )
+        if self.ceiling is not None and self.ceiling not in self.references:
+            raise ValueError(f"ceiling must be one of the references {sorted(self.references)}, got {self.ceiling!r}.")
 
     def within(self, max_steps: int | None) -> Task:
         """The same task with episodes that are cut off after ``max_steps`` steps, if not before."""
         limits = [limit for limit in (self.max_steps, max_steps) if limit is not None]
-        return replace(self, max_steps=min(limits, default=None))
+        shorter = replace(self, max_steps=min(limits, default=None))
+        return self if shorter == self else shorter.without_references()
+
+    def without_references(self) -> Task:
+        """The same task for which scripted players don't play."""
+        return replace(self, references={}, ceiling=None)
 
 
 def task_of(env: EnvBase) -> Task:
@@ -137,9 +196,9 @@ def _through(transform: Module, task: Task) -> Task:
         task = task.within(transform.max_steps)
     written = getattr(transform, "out_keys", [])
     if keys.REWARD in written:
-        task = replace(task, largest_return=math.inf)
+        task = replace(task.without_references(), largest_return=math.inf)
     if keys.EXTRINSIC_REWARD in written:
-        task = replace(task, largest_extrinsic_return=math.inf, smallest_extrinsic_return=-math.inf, in_order=None)
+        task = replace(task, largest_extrinsic_return=math.inf, smallest_extrinsic_return=-math.inf)
     return task
 
 
@@ -160,23 +219,3 @@ def _gymnasium_limit(wrapped: object) -> int | None:
         limits.append(getattr(wrapped, "_max_episode_steps", None))  # of gymnasium.wrappers.TimeLimit
         wrapped = getattr(wrapped, "env", None)
     return min((limit for limit in limits if isinstance(limit, int) and limit > 0), default=None)
-
-
-@dataclass(frozen=True)
-class GoalsInOrder:
-    """Counts ``in_order`` where the extrinsic reward is 1 for each of so many goals in order, and less for others.
-
-    Args:
-        num_goals: how many there are.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> GoalsInOrder(2)(TensorDict(extrinsic_reward=torch.tensor([[1.0], [0.01]]), batch_size=2))
-        tensor([0.5000, 0.0000])
-    """
-
-    num_goals: int
-
-    def __call__(self, after: TensorDictBase) -> Tensor:
-        return (after.get(keys.EXTRINSIC_REWARD).squeeze(-1) >= 1.0).float() / self.num_goals

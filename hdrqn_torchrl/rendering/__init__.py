@@ -1,11 +1,9 @@
 """Recorded episodes: what the agent sees, wants and does, as pictures, videos and terminal text."""
 
 from hdrqn_torchrl.rendering.episodes import Decision, Frame, Pursuit, Score, record_episodes
-from hdrqn_torchrl.rendering.grid_scene import GridScene
 from hdrqn_torchrl.rendering.levels import BarSpans, bar_spans
 from hdrqn_torchrl.rendering.picture import draw_frame
-from hdrqn_torchrl.rendering.scenes import Scene, scene_of
-from hdrqn_torchrl.rendering.screen_scene import ScreenScene
+from hdrqn_torchrl.rendering.scenes import PlainScene, scene_of
 from hdrqn_torchrl.rendering.terminal import draw_text, play_in_terminal
 from hdrqn_torchrl.rendering.video import check_video, hold, write_video
 
@@ -13,11 +11,9 @@ __all__ = [
     "BarSpans",
     "Decision",
     "Frame",
-    "GridScene",
+    "PlainScene",
     "Pursuit",
-    "Scene",
     "Score",
-    "ScreenScene",
     "bar_spans",
     "check_video",
     "draw_frame",

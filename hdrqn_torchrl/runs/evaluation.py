@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy
 import torch
@@ -21,7 +21,6 @@ _SUMMED = {
     "return": keys.REWARD,
     "extrinsic": keys.EXTRINSIC_REWARD,
     "intrinsic": keys.INTRINSIC_REWARD,
-    "success": keys.SUCCESS,
 }
 _FIGURES = {
     "return_mean": "return",
@@ -87,7 +86,7 @@ class EpisodeTracker:
     proper order, where the task has one).
 
     Args:
-        task: says how ``in_order`` is counted.
+        task: says whether subgoals have an order, and which entry tells success.
         per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
             attained, options for it that ended, and those of them that reached it.
     """
@@ -95,6 +94,7 @@ class EpisodeTracker:
     def __init__(self, task: Task = Task(), *, per_subgoal: bool = False) -> None:  # noqa: B008 (frozen)
         self.task, self.per_subgoal = task, per_subgoal
         self.sums: TensorDictBase | None = None  # [N]
+        self._in_order: Tensor | None = None  # [N] int64: subgoals attained so far, -1 once the order is broken
 
     def add(self, after: TensorDictBase) -> TensorDictBase:
         """Takes one step of all environments (what the environment wrote, ``[N]``).
@@ -102,9 +102,10 @@ class EpisodeTracker:
         Returns:
             The sums ``[N]`` up to and including this step; those of ended episodes are cleared afterwards.
         """
-        step = {name: after.get(key).squeeze(-1).float() for name, key in _SUMMED.items() if key in after}
-        if self.task.in_order is not None:
-            step["in_order"] = self.task.in_order(after)
+        summed = {**_SUMMED, "success": self.task.success}
+        step = {name: after.get(key).squeeze(-1).float() for name, key in summed.items() if key in after}
+        if self.task.ordered and keys.ATTAINED in after:
+            step["in_order"] = self._next_in_order(after)
         step["steps"] = torch.ones_like(step["return"])
         if self.per_subgoal:
             step |= _subgoal_events(after)
@@ -114,19 +115,30 @@ class EpisodeTracker:
         self.sums = sums.clone().masked_fill_(after.get(keys.DONE).squeeze(-1), 0.0)
         return sums
 
+    def _next_in_order(self, after: TensorDictBase) -> Tensor:
+        """The share of all subgoals that a step attained in its turn, 0 or 1/G ``[N]``."""
+        attained, done = after.get(keys.ATTAINED), after.get(keys.DONE).squeeze(-1)
+        number = attained.shape[-1]
+        before = torch.zeros_like(done, dtype=torch.int64) if self._in_order is None else self._in_order
+        wanted = before.unsqueeze(-1) == torch.arange(number, device=attained.device)
+        is_next = (attained == wanted).all(-1) & wanted.any(-1)
+        now = torch.where(is_next, before + 1, torch.where(attained.any(-1), -1, before))
+        self._in_order = now.masked_fill(done, 0)
+        return is_next.float() / number
+
     def finished(self, batch: TensorDictBase) -> TensorDictBase:
         """Takes a collected batch ``[N, T]``; returns the episodes ``[M]`` that ended in it."""
         after = batch.get("next").transpose(0, 1)  # [T, N]
         sums: TensorDictBase = torch.stack([self.add(step) for step in after.unbind(0)], 0)  # type: ignore[assignment]
         return sums[after.get(keys.DONE).squeeze(-1)]
 
-    def state_dict(self) -> dict[str, TensorDictBase | None]:
+    def state_dict(self) -> dict[str, Any]:
         """Sums of the episodes in progress."""
-        return {"sums": self.sums}
+        return {"sums": self.sums, "in_order": self._in_order}
 
-    def load_state_dict(self, state: dict[str, TensorDictBase | None]) -> None:
-        """Restores what :meth:`state_dict` returned."""
-        self.sums = state["sums"]
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned; older states hold no order, which then begins anew."""
+        self.sums, self._in_order = state["sums"], state.get("in_order")
 
 
 def _subgoal_events(after: TensorDictBase) -> dict[str, Tensor]:

@@ -3,24 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from torchrl.envs import EnvBase
-
-from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.envs.grid.ceilings import ceiling
-from hdrqn_torchrl.envs.grid.scripted import PLAYERS, PlayerName
 from hdrqn_torchrl.runs.files import write_whole
 from hdrqn_torchrl.runs.locking import InUse, lock
 from hdrqn_torchrl.runs.trainer import Trainer
 
-References = dict[str, dict[str, float]]
-
 
 def write_summary(
-    folder: Path, trainer: Trainer, result: dict[str, float], *, references: References
+    folder: Path, trainer: Trainer, result: dict[str, float], *, ceiling: float | None
 ) -> dict[str, float | None]:
     """Writes ``summary.json``.
 
@@ -28,7 +21,7 @@ def write_summary(
         folder: run folder.
         trainer: the trainer that ran.
         result: final greedy evaluation (:func:`~hdrqn_torchrl.runs.evaluation.evaluate`).
-        references: scripted players' results by name (:func:`references_for`); ``"memory"`` is the ceiling.
+        ceiling: return of the scripted player that marks it; ``None`` if there is none.
 
     Returns:
         What stands in it.
@@ -39,7 +32,7 @@ def write_summary(
         "updates": trainer.updates,
         "training_episodes": trainer.episodes,
         "wall_seconds": round(trainer.wall_seconds, 1),
-        "ceiling": ceiling_of(references),
+        "ceiling": ceiling,
     }
     write_whole(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
     return summary
@@ -71,23 +64,3 @@ def locked(folder: Path, *, patience_seconds: float = 0.0, tell: Callable[[str],
         except OSError as error:
             raise ValueError(f"the run folder must be writable, got {folder} ({error}); choose another one.") from error
         yield
-
-
-def references_for(
-    env: EnvBase, players: Sequence[PlayerName] = tuple(PLAYERS), *, tell: Callable[[str], None] | None = None
-) -> References:
-    """What the scripted players achieve on the task of ``env``, by name; empty for tasks that have none.
-
-    Args:
-        env: the bare environment.
-        players: which of them.
-        tell: called with a sentence before each that has to be simulated.
-    """
-    if not isinstance(env, MultiGoalGridEnv):
-        return {}
-    return {player: ceiling(player, env, tell=tell) for player in players}
-
-
-def ceiling_of(references: References) -> float | None:
-    """Return of the scripted player with the agent's own view and perfect memory; ``None`` if the task has none."""
-    return references["memory"]["return_mean"] if "memory" in references else None

@@ -21,6 +21,7 @@ class EvaluationSettings:
     final_episodes: int
     seed: int
     ceilings: bool = True
+    ceiling_seconds: float = 120.0  # for each scripted player
     max_steps: int | None = None
     """Of an episode."""
     env: dict[str, Any] = field(default_factory=dict)

@@ -46,7 +46,8 @@ class Trainer:
         checkpoints: where the whole training is saved; ``None``: nowhere.
         checkpoint_frames: frames between checkpoints.
         checkpoint_seconds: seconds after which one is written in any case.
-        ceiling: return of a scripted player, logged next to the greedy one.
+        ceiling: asked at every greedy evaluation for the return of a scripted player, which is logged next to the
+            agent's; ``None`` if there is none.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class Trainer:
         checkpoints: Checkpoints | None = None,
         checkpoint_frames: int = 50_000,
         checkpoint_seconds: float = 600.0,
-        ceiling: float | None = None,
+        ceiling: Callable[[], float | None] = lambda: None,
     ) -> None:
         self.algorithm, self.collector, self.logger, self.evaluate = algorithm, collector, logger, evaluate
         self.total_frames, self.log_frames, self.evaluation_frames = total_frames, log_frames, evaluation_frames
@@ -175,8 +176,8 @@ class Trainer:
             row |= {
                 f"greedy/{name.removesuffix('_mean').removesuffix('_rate')}": value for name, value in result.items()
             }
-            if self.ceiling is not None:
-                row["greedy/ceiling"] = self.ceiling
+            if (ceiling := self.ceiling()) is not None:
+                row["greedy/ceiling"] = ceiling
             if best := result["return_mean"] > self.best_return:
                 self.best_return = result["return_mean"]
         self.logger.log(row)

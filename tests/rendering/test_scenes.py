@@ -3,6 +3,7 @@ import pytest
 import torch
 from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT, small_env
 from torchrl.envs import GymEnv
+from user_envs import Corridor
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid.cells import palette
@@ -119,6 +120,20 @@ def test_names_and_ends():
     assert others == ["goal reached", "all 3 goals in order"]
 
 
-def test_other_environments_have_no_picture():
-    with pytest.raises(ValueError, match="env must be a MultiGoalGridEnv or a MontezumaEnv to be drawn, got GymEnv"):
-        scene_of(GymEnv("CartPole-v1"))
+def test_an_environment_without_a_scene_shows_what_it_renders_and_sees():
+    env = GymEnv("CartPole-v1", render_mode="rgb_array", categorical_action_encoding=True)
+    observation = env.reset()["observation"]
+    scene = scene_of(env, observation=observation)
+    assert scene.draw_world(300).size == (300, 200) and scene.draw_view(100).size == (100, 100)
+    assert scene.action_names == ("action 0", "action 1") and scene.subgoal_names == ()
+    assert scene.write_view().plain.count("0.0") >= 2  # four small numbers
+    ends = [scene.outcome(*each) for each in ((True, True), (False, True), (False, False))]
+    assert ends == ["success", "over", "time is up"]
+
+
+def test_an_environment_that_renders_nothing_is_shown_in_numbers():
+    scene = scene_of(Corridor(1), observation=torch.tensor([[2]], dtype=torch.uint8))
+    assert scene.write_world().plain == scene.write_view().plain == "[[2]]"
+    assert len(np.unique(pixels(scene.draw_world(120)).reshape(-1, 3), axis=0)) > 1
+    assert scene.subgoal_names == ("subgoal 0", "subgoal 1")
+    assert scene_of(Corridor(1)).write_view().plain == "no picture"

@@ -9,7 +9,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from user_envs import Corridor
 
 from hdrqn_torchrl.analysis.episodes import summarise
-from hdrqn_torchrl.envs import GoalsInOrder, Task, task_of
+from hdrqn_torchrl.envs import Task, task_of
 from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round
 
@@ -47,7 +47,7 @@ class TestEvaluate:
     def test_every_environment_plays_equally_often(self, episodes, played):
         assert evaluate(pair_env(4), always_right(), episodes=episodes)["episodes"] == played
 
-    def test_half_of_the_GoalsInOrder_is_a_rate_of_one_half(self):
+    def test_half_of_the_goals_in_order_is_a_rate_of_one_half(self):
         """In a row of three cells, one who starts on the left and goes right takes both goals, in either order."""
         env = small_env(300, layout=("#####", "#   #", "#####"), num_obstacles=0, max_steps=2, view=5)
         env.set_seed(3)
@@ -180,7 +180,7 @@ class TestEpisodeTracker:
 class TestTasksOfOthers:
     """A user's environment has fewer entries, and its episodes may be long or have no end."""
 
-    STATED = Task(max_steps=6, in_order=GoalsInOrder(2))
+    STATED = Task(max_steps=6, ordered=True)
 
     def played(self, name="v2", **settings):
         env = Corridor(4, **settings)

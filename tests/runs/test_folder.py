@@ -6,13 +6,10 @@ import time
 from types import SimpleNamespace
 
 import pytest
-from helpers import small_env
 from processes import start
 
-from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.runs.folder import ceiling_of, locked, references_for, write_summary
+from hdrqn_torchrl.runs.folder import locked, write_summary
 
-REFERENCES = {"planner": {"return_mean": 2.0}, "memory": {"return_mean": 1.9, "steps_mean": 16.5}}
 RESULT = {"return_mean": 0.5, "success_rate": 0.25, "in_order_rate": 0.4, "steps_mean": 40.0, "episodes": 100}
 TRAINER = SimpleNamespace(frames=2_000, updates=30, episodes=50, wall_seconds=12.3456)
 
@@ -24,7 +21,7 @@ def folder(tmp_path):
 
 
 def test_the_summary_holds_result_counts_and_ceiling(folder):
-    returned = write_summary(folder, TRAINER, RESULT, references=REFERENCES)
+    returned = write_summary(folder, TRAINER, RESULT, ceiling=1.9)
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == returned
     expected = {"frames": 2_000, "updates": 30, "training_episodes": 50, "wall_seconds": 12.3, "ceiling": 1.9}
@@ -33,22 +30,8 @@ def test_the_summary_holds_result_counts_and_ceiling(folder):
 
 
 def test_a_task_without_scripted_players_has_no_ceiling(folder):
-    assert write_summary(folder, TRAINER, RESULT, references={})["ceiling"] is None
+    assert write_summary(folder, TRAINER, RESULT, ceiling=None)["ceiling"] is None
     assert json.loads((folder / "summary.json").read_text())["ceiling"] is None
-
-
-def test_the_ceiling_is_that_of_the_player_with_the_agents_view():
-    assert ceiling_of(REFERENCES) == 1.9
-    assert ceiling_of({"planner": {"return_mean": 2.0}}) is None
-
-
-def test_players_that_have_to_play_are_told_of():
-    told = []
-    measured = references_for(MultiGoalGridEnv(2), tell=told.append)
-    assert list(measured) == ["planner", "memory", "egocentric", "random"] and told == []
-    played = references_for(small_env(2), ["memory"], tell=told.append)
-    assert list(played) == ["memory"] and played["memory"]["episodes"] == 1000
-    assert told == ["the scripted player 'memory' plays 1,000 episodes of this task"]
 
 
 def hold(folder):

@@ -193,7 +193,7 @@ def test_all_learners_store_a_batch_before_any_learns_from_it():
 
 
 def test_the_ceiling_stands_beside_the_greedy_return():
-    trainer = make_trainer(total_frames=10, ceiling=2.0)
+    trainer = make_trainer(total_frames=10, ceiling=lambda: 2.0)
     trainer.train()
     assert all(row["greedy/ceiling"] == 2.0 for row in trainer.logger.rows)
 

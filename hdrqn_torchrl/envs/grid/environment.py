@@ -15,18 +15,8 @@ from torchrl.envs import EnvBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules, GridState, StepEvents
+from hdrqn_torchrl.envs.grid.task import ROOMS, grid_task
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
-from hdrqn_torchrl.envs.task import GoalsInOrder, SubgoalSet, Task
-
-ROOMS = keys.OptionKeys("rooms")  # of rooms and doors
-
-
-def subgoals_of(rules: GridRules) -> tuple[SubgoalSet, ...]:
-    """The sets of subgoals of a grid task, from near to far: rooms and doors if they are any, and the goals."""
-    goals = SubgoalSet(names=tuple(f"goal {index + 1}" for index in range(rules.num_goals)))
-    if rules.places is None:
-        return (goals,)
-    return SubgoalSet(names=rules.places.names, prefix=ROOMS.prefix, repeatable=True), goals
 
 
 class MultiGoalGridEnv(EnvBase):
@@ -111,14 +101,7 @@ class MultiGoalGridEnv(EnvBase):
             "obstacle": obstacle,
             "num_obstacles": num_obstacles,
         }
-        self.task = Task(  # a goal pays 1 at most
-            max_steps=max_steps,
-            largest_return=float(num_goals),
-            largest_extrinsic_return=float(num_goals),
-            smallest_extrinsic_return=0.0,
-            in_order=GoalsInOrder(num_goals),
-            subgoals=subgoals_of(self.rules),
-        )
+        self.task = grid_task(self.rules, self.settings)
         self._make_specs()
         self._generator = torch.Generator(device)
         self.set_seed(torch.randint(2**31, ()).item() if seed is None else seed)

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from hdrqn_torchrl.envs.grid.drawing import draw_worlds
-from hdrqn_torchrl.envs.grid.environment import ROOMS
 from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules, GridState, StepEvents
+from hdrqn_torchrl.envs.grid.task import ROOMS
 
 
 class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):

@@ -10,15 +10,22 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.montezuma.emulators import Emulators, Snapshot
 from hdrqn_torchrl.envs.montezuma.practice import PracticeStarts
-from hdrqn_torchrl.envs.montezuma.screen import DOOR_SCORE, DOORS, SUBGOALS, Box, Ram, boxes_of, locate
+from hdrqn_torchrl.envs.montezuma.screen import (
+    DOOR_SCORE,
+    DOORS,
+    SUBGOALS,
+    Box,
+    Ram,
+    boxes_of,
+    locate,
+)
+from hdrqn_torchrl.envs.montezuma.task import montezuma_task
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
-from hdrqn_torchrl.envs.task import Task
-from hdrqn_torchrl.transforms import Window
 
 ALL_ACTIONS = tuple(range(18))
 USEFUL_ACTIONS = (0, 1, 2, 3, 4, 5, 11, 12)
@@ -31,9 +38,9 @@ class MontezumaEnv(EnvBase):
     """The first screen of Montezuma's Revenge as a batch of emulators.
 
     **Observation.** ``pixels`` ``[210, 160, 3]`` uint8, the native screen, and ``position`` ``[2]`` (x to the right, y
-    down, in pixels), the agent's centre. :func:`make_montezuma` makes the agent's window of them.
+    down, in pixels), the agent's centre. :func:`~hdrqn_torchrl.envs.make_montezuma` makes the agent's window of them.
 
-    **Reward.** ``reward``: what the score rose by. ``extrinsic_reward``: 1 for the key and 1 for a door. Beside them:
+    **Reward.** ``reward``: what the score rose by. ``extrinsic_reward``: 1 for the key and 1 for a door. Besides these:
     ``attained`` ``[G]`` (the agent came into a subgoal's box in this step, alive and not falling; took the key; opened
     the door; at a reset: it begins there), ``available`` ``[G]`` (subgoals worth choosing: not where the agent is, but
     for a door that it has the key for; not the key once it is taken), ``hazard`` (the agent died in this step),
@@ -45,6 +52,9 @@ class MontezumaEnv(EnvBase):
     Args:
         num_envs: number of emulators N; it is the batch size ``[N]``.
         subgoals: names in :data:`~hdrqn_torchrl.envs.montezuma.screen.BOXES`, or boxes by name.
+        key_and_door: the key and a door, whichever opens, are a farther set of subgoals than those places. It has the
+            entries ``attained`` and ``available``; those of the places are then ``places_attained``,
+            ``places_available``.
         max_steps: step limit of an episode.
         frame_skip: frames of a step.
         sticky: probability that a frame repeats the previous action (Machado et al., 2018, use 0.25).
@@ -77,6 +87,7 @@ class MontezumaEnv(EnvBase):
         num_envs: int = 8,
         *,
         subgoals: Sequence[str] | Mapping[str, Box] = SUBGOALS,
+        key_and_door: bool = False,
         max_steps: int = 500,
         frame_skip: int = 4,
         sticky: float = 0.0,
@@ -105,14 +116,15 @@ class MontezumaEnv(EnvBase):
                 f"actions must be different numbers from 0 to 17, got {list(actions)}; use USEFUL_ACTIONS."
             )
         super().__init__(device=torch.device(device or "cpu"), batch_size=(num_envs,))
-        self.subgoals = boxes_of(subgoals)
+        self.subgoals, self.key_and_door = boxes_of(subgoals), key_and_door
+        self._near = keys.OptionKeys("places" if key_and_door else "")
         self.num_envs, self.max_steps, self.actions, self.one_life = num_envs, max_steps, tuple(actions), one_life
         self.locator, self.noops, self.practice, self.practice_steps = locator, noops, practice, practice_steps
         self.emulators = Emulators("montezuma_revenge", num_envs, frame_skip=frame_skip, sticky=sticky, threads=threads)
         self.ram = Ram(self.emulators.ram)
         self._is_door = np.array([name in DOORS for name in self.subgoals])
-        self.task = Task(  # key and door; the score counts 100 and 300 for them
-            max_steps=max_steps, largest_return=400.0, largest_extrinsic_return=2.0, smallest_extrinsic_return=0.0
+        self.task = montezuma_task(
+            tuple(self.subgoals), self.actions, prefix=self._near.prefix, key_and_door=key_and_door, max_steps=max_steps
         )
         self.seen: tuple[int | None, int] | None = None
         """Side of the agent's window and of the image that is made of it, if that is known here; for pictures."""
@@ -133,8 +145,11 @@ class MontezumaEnv(EnvBase):
                     0, 255, shape=(n, *self.emulators.screens.shape[1:]), dtype=torch.uint8, device=device
                 ),
                 keys.POSITION: Unbounded(shape=(n, 2), dtype=torch.float32, device=device),
-                keys.ATTAINED: flags(n, len(self.subgoals), device=device),
-                keys.AVAILABLE: flags(n, len(self.subgoals), device=device),
+                **{
+                    key: flags(n, len(each), device=device)
+                    for each in self.task.subgoals
+                    for key in (each.keys.attained, each.keys.available)
+                },
                 keys.HAZARD: flags(n, 1, device=device),
                 keys.SUCCESS: flags(n, 1, device=device),
             },
@@ -162,7 +177,8 @@ class MontezumaEnv(EnvBase):
         return self._tensordict(
             {
                 **self._view(here),
-                keys.ATTAINED: here,
+                self._near.attained: here,
+                **self._far(keys.ATTAINED, no, no),
                 **dict.fromkeys((keys.HAZARD, keys.SUCCESS, keys.DONE, keys.TERMINATED, keys.TRUNCATED), no),
             }
         )
@@ -209,7 +225,8 @@ class MontezumaEnv(EnvBase):
                 **self._view(here),
                 keys.REWARD: score,
                 keys.EXTRINSIC_REWARD: took_key.astype(np.float32) + opened,
-                keys.ATTAINED: attained,
+                self._near.attained: attained,
+                **self._far(keys.ATTAINED, took_key, opened),
                 keys.HAZARD: died,
                 keys.SUCCESS: opened,
                 keys.DONE: over | truncated,
@@ -246,7 +263,16 @@ class MontezumaEnv(EnvBase):
             key = list(self.subgoals).index("key")
             available[:, key] = self.ram.key_is_there()
         available |= self.ram.has_key()[:, None] & self._is_door
-        return {keys.PIXELS: self.emulators.screens, keys.POSITION: self.positions(), keys.AVAILABLE: available}
+        return {
+            keys.PIXELS: self.emulators.screens,
+            keys.POSITION: self.positions(),
+            self._near.available: available,
+            **self._far(keys.AVAILABLE, self.ram.key_is_there(), np.ones(self.num_envs, bool)),
+        }
+
+    def _far(self, entry: str, key: NDArray[np.bool_], door: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
+        """An entry of the farther set of subgoals ``[N, 2]``, if there is one."""
+        return {entry: np.stack([key, door], -1)} if self.key_and_door else {}
 
     def _tensordict(self, entries: Mapping[str, NDArray]) -> TensorDict:
         """Copies of the arrays, flat ones ``[N]`` as columns ``[N, 1]``."""
@@ -286,33 +312,3 @@ class MontezumaEnv(EnvBase):
         self.steps, self._inside = (state_dict[name].cpu().numpy().copy() for name in ("steps", "inside"))
         self.total_steps = state_dict["total_steps"]
         self._generator.bit_generator.state = state_dict["generator"]
-
-
-def make_montezuma(
-    num_envs: int = 8,
-    *,
-    view: int | None = 70,
-    size: int = 44,
-    keep_pixels: bool = False,
-    **settings: Any,
-) -> TransformedEnv:
-    """Montezuma's Revenge as the paper's agent sees it: through a window around it.
-
-    Args:
-        num_envs: number of emulators.
-        view: side of the window in pixels of the screen, black beyond its edges; ``None``: the whole screen.
-        size: side of the square image that it is resized to.
-        keep_pixels: keep the whole screen beside it (100 kB for each step).
-        settings: for :class:`MontezumaEnv`.
-
-    Returns:
-        An environment with ``observation`` ``[3, size, size]`` uint8 and the other keys of :class:`MontezumaEnv`.
-
-    Examples:
-        >>> env = make_montezuma(num_envs=2, seed=0)
-        >>> env.rollout(3)["observation"].shape
-        torch.Size([2, 3, 3, 44, 44])
-    """
-    env = MontezumaEnv(num_envs, **settings)
-    env.seen = view, size
-    return TransformedEnv(env, Window(view=view, size=size, keep_pixels=keep_pixels))

@@ -41,6 +41,12 @@ DOORS = ("left_door", "right_door")
 DOOR_SCORE = 300.0
 """What a door brings; the key brings 100."""
 
+ACTION_NAMES = (
+    "noop", "jump", "↑ up", "→ right", "← left", "↓ down", "↗ up right", "↖ up left", "↘ down right", "↙ down left",
+    "jump ↑", "jump →", "jump ←", "jump ↓", "jump ↗", "jump ↖", "jump ↘", "jump ↙",
+)  # fmt: skip
+"""Of ALE's actions."""
+
 _ROOM, _X, _Y, _POSE, _DYING, _INVENTORY, _OBJECTS, _FALLING = 3, 42, 43, 53, 55, 65, 66, 88  # bytes of the RAM
 _FIRST_ROOM, _KEY, _KEY_IS_THERE = 1, 2, 1
 _DEAD_POSES = (22, 30)  # after a fall, by the skull; they last one step longer than _DYING

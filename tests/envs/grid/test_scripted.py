@@ -11,7 +11,8 @@ from hdrqn_torchrl.envs import (
     play_episodes,
     scripted_ceiling,
 )
-from hdrqn_torchrl.envs.grid.ceilings import MEASURED, MEASURED_EPISODES, StandardTask, measure, standard_tasks
+from hdrqn_torchrl.envs.grid.ceilings import measure, standard_tasks
+from hdrqn_torchrl.envs.grid.measured import MEASURED, MEASURED_EPISODES, StandardTask
 
 TASKS = {
     ("open", 2): {"layout": "open", "num_goals": 2, "max_steps": 50},

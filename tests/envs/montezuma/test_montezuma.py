@@ -8,7 +8,8 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 pytest.importorskip("ale_py")
 
-from hdrqn_torchrl.envs.montezuma.environment import ALL_ACTIONS, USEFUL_ACTIONS, MontezumaEnv, make_montezuma
+from hdrqn_torchrl.envs.montezuma.environment import ALL_ACTIONS, USEFUL_ACTIONS, MontezumaEnv
+from hdrqn_torchrl.envs.montezuma.making import make_montezuma
 from hdrqn_torchrl.envs.montezuma.screen import BOXES, SUBGOALS, locate
 
 ROUTE = json.loads((Path(__file__).parent / "montezuma_route.json").read_text())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,15 +11,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 from rich.text import Text
 
-from hdrqn_torchrl.envs import MontezumaEnv
-from hdrqn_torchrl.envs.montezuma.screen import Box
-from hdrqn_torchrl.rendering.style import Colour
+from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv
+from hdrqn_torchrl.envs.montezuma.screen import ACTION_NAMES, BOXES, DOORS, Box
+from hdrqn_torchrl.envs.scene import Colour
 from hdrqn_torchrl.transforms.window import cut_out, resized
 
-_ACTIONS = (
-    "noop", "jump", "↑ up", "→ right", "← left", "↓ down", "↗ up right", "↖ up left", "↘ down right", "↙ down left",
-    "jump ↑", "jump →", "jump ←", "jump ↓", "jump ↗", "jump ↖", "jump ↘", "jump ↙",
-)  # fmt: skip
 _COLOURS: tuple[Colour, ...] = (
     (230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0), (204, 121, 167),
 )  # fmt: skip  # Okabe and Ito
@@ -34,7 +30,8 @@ class ScreenScene:
     screen: NDArray[np.uint8]
     """``[210, 160, 3]``"""
     position: tuple[float, float]
-    boxes: Mapping[str, Box]
+    boxes: Mapping[str, Sequence[Box]]
+    """Of each subgoal."""
     actions: tuple[int, ...]
     seen: tuple[int | None, int] | None
     """Side of the agent's window (``None``: it sees the whole screen) and of the image made of it."""
@@ -47,12 +44,15 @@ class ScreenScene:
         """The present screen of the first emulator."""
         x, y = env.positions()[0].tolist()
         screen = env.emulators.screens[0].copy()
-        return cls(screen, (x, y), env.subgoals, env.actions, env.seen, subgoal)
+        boxes: Mapping[str, Sequence[Box]] = {name: (box,) for name, box in env.subgoals.items()}
+        if env.key_and_door:
+            boxes = {"key": (BOXES["key"],), "door": [BOXES[door] for door in DOORS]}
+        return cls(screen, (x, y), boxes, env.actions, env.seen, subgoal)
 
     @property
     def action_names(self) -> tuple[str, ...]:
         """Those of the actions that the agent has."""
-        return tuple(_ACTIONS[action] for action in self.actions)
+        return tuple(ACTION_NAMES[action] for action in self.actions)
 
     @property
     def subgoal_names(self) -> tuple[str, ...]:
@@ -73,10 +73,11 @@ class ScreenScene:
         shape = size, size * 3 // 4
         image = Image.fromarray(self.screen).resize(shape, Image.Resampling.NEAREST)
         draw = ImageDraw.Draw(image, "RGBA")
-        for index, (box, colour) in enumerate(zip(self.boxes.values(), self.subgoal_colours, strict=True)):
+        for index, (boxes, colour) in enumerate(zip(self.boxes.values(), self.subgoal_colours, strict=True)):
             active = index == self.subgoal
-            draw.rectangle(self._scaled(box, shape), outline=colour, width=3 if active else 1,
-                           fill=(*colour, 90) if active else None)  # fmt: skip
+            fill = (*colour, 90) if active else None
+            for box in boxes:
+                draw.rectangle(self._scaled(box, shape), outline=colour, width=3 if active else 1, fill=fill)
         if self.seen is not None and self.seen[0] is not None:
             x, y = self.position
             half = self.seen[0] / 2

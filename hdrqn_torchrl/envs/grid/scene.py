@@ -11,7 +11,7 @@ from rich.text import Text
 
 from hdrqn_torchrl.envs.grid.cells import AGENT_COLOUR, FIRST_GOAL, FLOOR, OBSTACLE, WALL, palette
 from hdrqn_torchrl.envs.grid.rules import GridRules, GridState
-from hdrqn_torchrl.rendering.style import Colour, font
+from hdrqn_torchrl.envs.scene import Colour, font
 
 _UNSEEN = (150, 150, 150)  # what lies outside the view fades into this
 _LINE = (226, 226, 226)  # between cells

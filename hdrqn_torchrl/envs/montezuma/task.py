@@ -1,0 +1,53 @@
+"""What Montezuma's Revenge tells about itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from torchrl.envs import EnvBase
+
+from hdrqn_torchrl.envs.montezuma.screen import ACTION_NAMES
+from hdrqn_torchrl.envs.task import SubgoalSet, Task
+
+if TYPE_CHECKING:
+    from hdrqn_torchrl.envs.scene import Scene
+
+
+def montezuma_task(
+    places: tuple[str, ...], actions: Sequence[int], *, prefix: str, key_and_door: bool, max_steps: int
+) -> Task:
+    """The task of the first screen: key and door, for which the score counts 100 and 300.
+
+    Args:
+        places: names of the places that are subgoals.
+        actions: ALE's numbers of the actions the agent has.
+        prefix: of the places' entries.
+        key_and_door: whether key and door are a farther set of subgoals.
+        max_steps: step limit of an episode.
+    """
+    subgoals = SubgoalSet(names=places, prefix=prefix, repeatable=True)
+    return Task(
+        max_steps=max_steps,
+        largest_return=400.0,
+        largest_extrinsic_return=2.0,
+        smallest_extrinsic_return=0.0,
+        subgoals=(subgoals, SubgoalSet(names=("key", "door"))) if key_and_door else (subgoals,),
+        actions=tuple(ACTION_NAMES[action] for action in actions),
+        scene=screen_scene,
+        screen=first_screen,
+    )
+
+
+def screen_scene(env: EnvBase, *, subgoal: int | None = None, action: int | None = None) -> Scene:
+    """The present screen of a :class:`~hdrqn_torchrl.envs.MontezumaEnv`; it does not show the action."""
+    from hdrqn_torchrl.envs.montezuma.scene import ScreenScene  # takes a second: it loads what draws
+
+    return ScreenScene.of(env, subgoal)
+
+
+def first_screen(env: EnvBase) -> NDArray[np.uint8]:
+    """The screen on which an episode begins, ``[210, 160, 3]``."""
+    return env.emulators.start.screen
