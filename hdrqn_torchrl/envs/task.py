@@ -17,6 +17,7 @@ from torchrl.envs.transforms import StepCounter, TransformedEnv
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
+from hdrqn_torchrl.transforms import Critic
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.envs.scene import Scene  # whose pictures take a second to load
@@ -194,12 +195,23 @@ def _through(transform: Module, task: Task) -> Task:
     """What is left of a statement behind a transform: one that changes rewards makes what was said of them void."""
     if isinstance(transform, StepCounter):
         task = task.within(transform.max_steps)
+    if isinstance(transform, Critic):
+        task = _with_subgoals(task, transform)
     written = getattr(transform, "out_keys", [])
     if keys.REWARD in written:
         task = replace(task.without_references(), largest_return=math.inf)
     if keys.EXTRINSIC_REWARD in written:
         task = replace(task, largest_extrinsic_return=math.inf, smallest_extrinsic_return=-math.inf)
     return task
+
+
+def _with_subgoals(task: Task, critic: Critic) -> Task:
+    """The task with the critic's set of subgoals in place of the one with the same prefix, or as one more."""
+    own = SubgoalSet(names=critic.names, prefix=critic.prefix, repeatable=critic.repeatable)
+    sets = [own if each.prefix == own.prefix else each for each in task.subgoals]
+    if own not in sets:
+        sets = [own, *sets] if own.prefix else [*sets, own]
+    return replace(task, subgoals=tuple(sets))
 
 
 def _task_of_worker(env: BatchedEnvBase) -> Task:

@@ -173,7 +173,7 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> It
     """The frames of one episode."""
     base, tensordict = getattr(env, "base_env", env), env.reset()
     own, *above = algorithm.levels
-    score = Score((False,) * tensordict[keys.ATTAINED].shape[-1], intrinsic=None if own.reward_key is None else 0.0)
+    score = Score((False,) * len(_attained(tensordict[0])), intrinsic=None if own.reward_key is None else 0.0)
     pursuits: tuple[Pursuit, ...] = ()
     event = ""
     while True:
@@ -221,7 +221,7 @@ def _decision(view: LevelView, now: TensorDictBase) -> Decision:
 
 def _last(frame: Frame, base: EnvBase, after: TensorDictBase) -> Frame:
     """The end of an episode: the world after the last step."""
-    success = bool(after[keys.SUCCESS])
+    success = _happened(after, keys.SUCCESS)
     return replace(
         frame,
         scene=scene_of(base, subgoal=_choice(frame.pursuits)),
@@ -241,8 +241,8 @@ def _add(score: Score, own: LevelView, after: TensorDictBase) -> Score:
         score,
         steps=score.steps + 1,
         total=score.total + after[keys.REWARD].item(),
-        extrinsic=score.extrinsic + after[keys.EXTRINSIC_REWARD].item(),
-        reached=tuple(a or b for a, b in zip(score.reached, after[keys.ATTAINED].tolist(), strict=True)),
+        extrinsic=score.extrinsic + _extrinsic_reward(after),
+        reached=tuple(a or b for a, b in zip(score.reached, _attained(after), strict=True)),
     )
     if score.intrinsic is None:
         return score
@@ -253,10 +253,10 @@ def _add(score: Score, own: LevelView, after: TensorDictBase) -> Score:
 def _tell(frame: Frame, above: Sequence[LevelView], after: TensorDictBase) -> str:
     """What a step did, in a few words."""
     told = []
-    for name, attained in zip(frame.scene.subgoal_names, after[keys.ATTAINED].tolist(), strict=True):
+    for name, attained in zip(frame.scene.subgoal_names, _attained(after), strict=False):
         if attained:
-            told.append(f"{name} reached, rᵉˣ {after[keys.EXTRINSIC_REWARD].item():+.2f}")
-    if after[keys.HAZARD]:
+            told.append(f"{name} reached, rᵉˣ {_extrinsic_reward(after):+.2f}")
+    if _happened(after, keys.HAZARD):
         told.append(frame.scene.hazard)
     for view, pursuit in zip(above[:-1], frame.pursuits[:-1], strict=True):
         if after[view.reached_key]:
@@ -264,6 +264,21 @@ def _tell(frame: Frame, above: Sequence[LevelView], after: TensorDictBase) -> st
     if above and after[keys.OPTION_DONE] and not (after[keys.SUBGOAL_REACHED] | after[keys.DONE]):
         told.append("option given up")
     return ", ".join(told)
+
+
+def _attained(after: TensorDictBase) -> list[bool]:
+    """Of the farthest set; none where the environment has no subgoals."""
+    return after[keys.ATTAINED].tolist() if keys.ATTAINED in after else []
+
+
+def _extrinsic_reward(after: TensorDictBase) -> float:
+    """The task's reward where it has no other."""
+    return after[keys.EXTRINSIC_REWARD if keys.EXTRINSIC_REWARD in after else keys.REWARD].item()
+
+
+def _happened(after: TensorDictBase, key: str) -> bool:
+    """Whether a flag is set that not every environment has."""
+    return key in after and bool(after[key])
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -27,10 +27,14 @@ class Critic(Transform):
     Args:
         num_subgoals: G.
         verdict: which subgoals a step attained. A reset attains none.
-        attained_key: the entry written.
+        names: of the subgoals; ``None``: numbers.
+        prefix: of the entries that concern this set of subgoals (:class:`~hdrqn_torchrl.keys.OptionKeys`); empty for
+            the farthest one.
+        repeatable: whether a subgoal can be attained more than once in an episode.
+        attained_key: the entry written; ``None``: ``attained`` with the prefix.
 
     Raises:
-        ValueError: if ``num_subgoals`` is not positive.
+        ValueError: if ``num_subgoals`` is not positive, or there is another number of names.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -41,11 +45,25 @@ class Critic(Transform):
         torch.Size([3, 2])
     """
 
-    def __init__(self, num_subgoals: int, verdict: Verdict, *, attained_key: NestedKey = keys.ATTAINED) -> None:
+    def __init__(
+        self,
+        num_subgoals: int,
+        verdict: Verdict,
+        *,
+        names: Sequence[str] | None = None,
+        prefix: str = "",
+        repeatable: bool = False,
+        attained_key: NestedKey | None = None,
+    ) -> None:
         if num_subgoals < 1:
             raise ValueError(f"num_subgoals must be >= 1, got {num_subgoals}; give one for each subgoal of the task.")
-        super().__init__(in_keys=[], out_keys=[attained_key])
-        self.num_subgoals, self.verdict, self.attained_key = num_subgoals, verdict, attained_key
+        if names is not None and len(names) != num_subgoals:
+            raise ValueError(f"names must be one for each of {num_subgoals} subgoals, got {len(names)}.")
+        self.attained_key = attained_key or keys.OptionKeys(prefix).attained
+        super().__init__(in_keys=[], out_keys=[self.attained_key])
+        self.num_subgoals, self.verdict = num_subgoals, verdict
+        self.names = tuple(names or (f"subgoal {index}" for index in range(num_subgoals)))
+        self.prefix, self.repeatable = prefix, repeatable
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.set(self.attained_key, self.verdict(next_tensordict))

@@ -133,7 +133,11 @@ class SubgoalTransform(Transform):
         super().__init__(in_keys=in_keys, out_keys=[*self._carried, *self._reported, self.intrinsic_reward_key])
         self.num_subgoals, self.gamma, self.max_option_steps = num_subgoals, gamma, max_option_steps
         self.repeatable = repeatable
-        self.critic = None if critic is None else Critic(num_subgoals, critic, attained_key=self.attained_key)
+        self.critic = (
+            None
+            if critic is None
+            else Critic(num_subgoals, critic, prefix=prefix, repeatable=repeatable, attained_key=self.attained_key)
+        )
         self.reward = IntrinsicReward(reached=reached_reward, hazard=hazard_reward, wrong_subgoal=wrong_subgoal_reward)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

@@ -782,7 +782,7 @@ class TestRepeatedActions:
         assert torch.isfinite(learner.learn()["loss"])
 
     @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
-    def test_nor_over_options(self, name):
+    def test_random_stretches_do_not_last_over_options(self, name):
         """Only every second option explores here: it must not pass its stretch on."""
         torch.manual_seed(0)
         env = small_env(16, max_steps=30, num_goals=2)

@@ -28,7 +28,7 @@ class TestPhases:
         exploration = EpsilonGreedy(1.0, 0.1, anneal_frames=10)
         return Phases(PhaseOne(**settings), 2, exploration, None), exploration
 
-    def test_the_first_ends_with_success(self):
+    def test_the_first_phase_ends_when_every_subgoal_is_reached_often_enough(self):
         phases, _ = self.make(success=0.75, min_options=4)
         for reached, phase in (((True, True), 1), ((False, False), 1), ((True,) * 4, 2)):
             assert phases.phase == 1
@@ -37,14 +37,14 @@ class TestPhases:
         phases.observe(options(False, False, False, False))
         assert phases.phase == 2  # it does not come back
 
-    def test_or_with_time(self):
+    def test_the_first_phase_ends_after_its_frames_in_any_case(self):
         phases, _ = self.make(max_frames=4)
         phases.observe(options(False))
         assert phases.phase == 1
         phases.observe(options(False))
         assert phases.phase == 2
 
-    def test_epsilon_stands_still_meanwhile(self):
+    def test_epsilon_stands_still_in_the_first_phase(self):
         phases, exploration = self.make(max_frames=4)
         exploration.step(5)
         assert exploration.epsilon == 1.0
@@ -52,7 +52,7 @@ class TestPhases:
         exploration.step(5)
         assert exploration.epsilon.item() == pytest.approx(0.55)
 
-    def test_state(self):
+    def test_a_restored_phase_goes_on(self):
         phases, _ = self.make(max_frames=4)
         phases.observe(options(True, False))
         other, exploration = self.make(max_frames=4)
@@ -60,7 +60,7 @@ class TestPhases:
         assert (other.phase, other.frames, other.success.rates.tolist()) == (2, 4, [0.5, 0.5])
         assert not exploration.held
 
-    def test_metrics(self):
+    def test_metrics_tell_phase_and_success(self):
         phases, _ = self.make()
         assert math.isnan(phases.metrics()["phase/success_1"])  # no option has ended yet
         phases.observe(options(True, False))
@@ -74,7 +74,7 @@ class TestPhases:
             Phases(PhaseOne(), 2, EpsilonGreedy(0.5), None)
 
     @pytest.mark.parametrize("settings", [{"success": 0.0}, {"success": 1.1}, {"max_frames": 0}], ids=str)
-    def test_wrong_settings(self, settings):
+    def test_settings_out_of_range_are_refused(self, settings):
         (name,) = settings
         with pytest.raises(ValueError, match=f"{name} must .*, got {settings[name]}; "):
             PhaseOne(**settings)

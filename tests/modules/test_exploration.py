@@ -6,7 +6,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hdrqn_torchrl import algorithms
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
+from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, SuccessEpsilonGreedy, compact_network
 from hdrqn_torchrl.modules.exploration import choose, mask_values
 
 VALUES = torch.tensor([3.0, 9.0, 1.0, 5.0])
@@ -74,7 +74,7 @@ class TestMask:
         assert choices[::2].unique().tolist() == ([0, 1, 2, 3] if kind == ExplorationType.RANDOM else [1])
         assert (choices[1::2] == 2).all()
 
-    def test_mask_values(self):
+    def test_masked_values_are_minus_infinity_unless_nothing_is_allowed(self):
         inf = float("inf")
         masked = mask_values(torch.tensor([[1.0, 2.0], [1.0, 2.0]]), torch.tensor([[True, False], [False, False]]))
         assert masked.tolist() == [[1.0, -inf], [1.0, 2.0]]
@@ -97,7 +97,7 @@ def test_the_schedule_travels_in_the_state_dict():
         ({"anneal_frames": 0}, "anneal_frames must be >= 1, got 0; "),
     ],
 )
-def test_wrong_values(arguments, message):
+def test_values_out_of_range_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         EpsilonGreedy(**arguments)
 
@@ -111,7 +111,7 @@ class TestLadder:
         assert exploration.epsilons(torch.zeros(3, 7)).flatten().tolist() == pytest.approx([0.5, 0.5**2.5, 0.0625])
         assert exploration.epsilons(torch.tensor(0.0)).item() == 0.5
 
-    def test_without_it_all_have_the_same(self):
+    def test_without_a_ladder_all_environments_have_the_same_epsilon(self):
         assert EpsilonGreedy(0.5, 0.5).epsilons(torch.zeros(4)).item() == 0.5
 
     def test_the_rungs_move_with_the_schedule(self):
@@ -126,7 +126,7 @@ class TestLadder:
             choices, _ = EpsilonGreedy(0.5, 0.5, ladder=1.0)(values.expand(2, 20_000, 100))
         assert (choices != 0).float().mean(1).tolist() == pytest.approx([0.495, 0.2475], abs=0.02)
 
-    def test_a_negative_one(self):
+    def test_a_negative_ladder_is_refused(self):
         with pytest.raises(ValueError, match=r"ladder must be >= 0 and finite, got -1\.0; "):
             EpsilonGreedy(ladder=-1.0)
 
@@ -155,6 +155,16 @@ class TestChoose:
         root = TensorDict({}, [3])
         assert choose(EpsilonGreedy(0.0, 0.0), VALUES.expand(3, 4), root, "count").tolist() == [1, 1, 1]
         assert root.is_empty()
+
+
+def test_a_level_between_may_explore_by_the_success_of_what_it_pursues():
+    env = MultiGoalGridEnv(num_envs=8, layout="nine_rooms", seed=0, max_steps=30)
+    agent = algorithms.make_v3(env, compact_network(), levels=3, middle_exploration=SuccessEpsilonGreedy())
+    between, goals = agent.explorations["rooms"], len(env.task.subgoals[-1])
+    steps = agent.transform(env).rollout(60, agent.policy, break_when_any_done=False)
+    between.observe(steps)
+    ended = steps["next", "active_subgoal"][steps["next", "option_done"].squeeze(-1)]
+    assert torch.equal(between.success.options, ended.bincount(minlength=goals)) and len(ended)
 
 
 @pytest.mark.parametrize("level", ["sub", "meta"])

@@ -51,7 +51,7 @@ class TestRepeatingEpsilonGreedy:
         assert ((choices == 0) | (choices == after[..., 0]))[~going_on].all()
 
     @pytest.mark.parametrize(("exponent", "max_repeats"), [(2.0, 15), (1.0, 4), (2.0, 1)])
-    def test_lengths_of_stretches(self, exponent, max_repeats):
+    def test_lengths_of_stretches_follow_the_cut_zeta_distribution(self, exponent, max_repeats):
         exploration = RepeatingEpsilonGreedy(1.0, 1.0, exponent=exponent, max_repeats=max_repeats)
         _, carried = self.play(exploration, steps=100)
         lengths = carried[1:, :, 1][carried[:-1, :, 1] == 0] + 1
@@ -73,7 +73,7 @@ class TestRepeatingEpsilonGreedy:
             choice, carried = RepeatingEpsilonGreedy(1.0, 1.0)(VALUES.expand(5, 4), carried=torch.full((5, 2), 3))
         assert (choice == 1).all() and (carried == 0).all()
 
-    def test_a_single_environment_without_batch(self):
+    def test_a_single_environment_needs_no_batch_dimension(self):
         with set_exploration_type(ExplorationType.RANDOM):
             choice, carried = RepeatingEpsilonGreedy(0.0, 0.0)(VALUES, carried=torch.tensor([2, 5]))
         assert choice.item() == 2 and carried.tolist() == [2, 4]
@@ -118,6 +118,6 @@ class TestRepeatingEpsilonGreedy:
             ({"max_repeats": 0}, "max_repeats must be >= 1, got 0; "),
         ],
     )
-    def test_wrong_values(self, arguments, message):
+    def test_values_out_of_range_are_refused(self, arguments, message):
         with pytest.raises(ValueError, match=message):
             RepeatingEpsilonGreedy(**arguments)

@@ -30,7 +30,7 @@ class TestSubgoalSuccess:
             success.observe(batch(each))
         assert success.rates.item() == pytest.approx(0.4)
 
-    def test_then_the_last_ones_count(self):
+    def test_only_the_last_options_count_once_the_window_is_full(self):
         success = SubgoalSuccess(1, window=4)
         for _ in range(20):
             success.observe(batch(LOST))
@@ -39,14 +39,14 @@ class TestSubgoalSuccess:
         success.observe(batch(*[WON] * 8))
         assert success.rates.item() == 1.0
 
-    def test_nothing_ended(self):
+    def test_steps_that_end_no_option_change_nothing(self):
         success = SubgoalSuccess(1)
         success.observe(batch(WON))
         success.observe(batch(GOES_ON, GOES_ON))
         assert success.rates.item() == 1.0
 
     @pytest.mark.parametrize(("name", "settings"), [("num_subgoals", (0,)), ("window", (2,))])
-    def test_wrong_settings(self, name, settings):
+    def test_sizes_below_one_are_refused(self, name, settings):
         with pytest.raises(ValueError, match=f"{name} must be >= 1, got 0; "):
             SubgoalSuccess(*settings, **({"window": 0} if name == "window" else {}))
 
@@ -93,7 +93,7 @@ class TestSuccessEpsilonGreedy:
         exploration.observe(steps)
         assert exploration.success.rates.tolist() == [1.0, 0.0]
 
-    def test_the_schedule_counts_too(self):
+    def test_epsilon_falls_with_the_schedule_as_well(self):
         exploration = SuccessEpsilonGreedy(1.0, 0.1, anneal_frames=100)
         exploration.set_num_subgoals(1)
         exploration.step(1000)

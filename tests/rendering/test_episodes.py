@@ -3,7 +3,8 @@ from functools import cache
 import pytest
 import torch
 from helpers import RIGHT, build, small_env
-from torchrl.envs import ExplorationType, set_exploration_type
+from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.envs.transforms import ExcludeTransform
 from walk import FLAT, SECOND_GOAL, TWO_LEVELS, make_agent, walk
 
 from hdrqn_torchrl.rendering import Score, record_episodes
@@ -120,6 +121,15 @@ def test_one_seed_repeats_and_another_differs():
     again, other = (record_episodes(env, agent, seed=seed, epsilon=0.5, episodes=2) for seed in (4, 5))
     assert [facts(frame) for frame in first] == [facts(frame) for frame in again]
     assert [facts(frame) for frame in first] != [facts(frame) for frame in other]
+
+
+def test_a_task_without_subgoals_hazard_or_success_can_be_watched():
+    optional = ("attained", "hazard", "success", "extrinsic_reward")
+    env = TransformedEnv(small_env(1), ExcludeTransform(*optional))
+    agent = make_agent("drqn", env)
+    *played, last = record_episodes(agent.transform(env), agent)
+    assert last.outcome and not last.success and last.score.reached == ()
+    assert last.score.extrinsic == last.score.total and not any(frame.event for frame in played)
 
 
 def test_recording_leaves_the_agent_and_the_global_generator_as_they_were():

@@ -9,11 +9,12 @@ from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
-from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.algorithms import Algorithm, make_v3
 from hdrqn_torchrl.algorithms.base import copies_of
 from hdrqn_torchrl.algorithms.levels import make_levels
 from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.envs import MultiGoalGridEnv, SubgoalSet
+from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.rendering import bar_spans, draw_frame, draw_text, record_episodes
 from hdrqn_torchrl.rendering.levels import levels_of
 from hdrqn_torchrl.transforms import Critic, SubgoalTransform
@@ -60,7 +61,7 @@ def frames():
         policy=Scripted(),
         learners={},
         explorations={},
-        make_transforms=copies_of(Critic(2, muddy, attained_key="places_attained"), SubgoalTransform(2), nearer),
+        make_transforms=copies_of(Critic(2, muddy, prefix="places"), SubgoalTransform(2), nearer),
         levels=views_of(make_levels(4, [PLACES, GOALS])),
     )
     return record_episodes(agent.transform(env), agent)
@@ -100,6 +101,19 @@ def test_pictures_and_text_have_a_line_for_the_level_between():
     console = Console(width=200, record=True, file=io.StringIO())
     console.print(draw_text(frame, spans))
     assert "by way of mud" in console.export_text()
+
+
+def test_an_agent_of_three_levels_shows_the_values_that_each_level_chose_by():
+    env = MultiGoalGridEnv(1, layout="nine_rooms", view=3, max_steps=12, seed=0)
+    agent = make_v3(env, compact_network(8, (8,)), levels=3, memory_size=8, head_size=8)
+    *played, last = record_episodes(agent.transform(env), agent)
+    rooms, goals = env.task.subgoals
+    assert len(played) == 12 and last.outcome
+    for frame in played:
+        assert [pursuit.names for pursuit in frame.pursuits] == [rooms.names, goals.names]
+        for decision in (frame.action, *(pursuit.decision for pursuit in frame.pursuits)):
+            assert decision.choice == decision.best and len(set(decision.values)) > 1
+    assert draw_frame(played[0], bar_spans(played)).any()
 
 
 def test_an_agent_that_tells_no_levels_is_refused():

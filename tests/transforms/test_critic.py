@@ -7,9 +7,11 @@ from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import ExcludeTransform, RenameTransform
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.envs import MultiGoalGridEnv, task_of
 from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.transforms import Critic, SubgoalTransform
+
+GOALS = task_of(small_env()).subgoals[-1].names
 
 
 def mirrored(after):
@@ -82,6 +84,34 @@ def test_without_a_critic_such_an_environment_is_refused():
         build("v3", env)
 
 
-def test_a_critic_needs_subgoals():
-    with pytest.raises(ValueError, match="num_subgoals must be >= 1, got 0; "):
-        Critic(0, mirrored)
+@pytest.mark.parametrize(
+    ("settings", "sets"),
+    [
+        ({}, [("", ("subgoal 0", "subgoal 1", "subgoal 2"))]),
+        ({"names": ("left", "right", "obstacle")}, [("", ("left", "right", "obstacle"))]),
+        ({"prefix": "places"}, [("places", ("subgoal 0", "subgoal 1", "subgoal 2")), ("", GOALS)]),
+    ],
+)
+def test_the_task_has_the_critics_subgoals(settings, sets):
+    """Another number of them than the environment's own, or one set more, for an agent of three levels."""
+    critic = Critic(3, lambda after: torch.cat([after["collected"], after["hazard"]], -1), **settings)
+    base = small_env(4)
+    renamed = TransformedEnv(base, RenameTransform(["attained"], ["collected"], create_copy="prefix" in settings))
+    env = TransformedEnv(renamed, critic)
+    assert [(each.prefix, each.names) for each in task_of(env).subgoals] == sets
+    agent = build("v3", env, levels=len(sets) + 1)
+    assert [view.choice_names for view in agent.levels[1:]] == [names for _, names in sets]
+    steps = agent.transform(env).rollout(10, agent.policy, break_when_any_done=False)
+    assert steps["next", critic.attained_key].shape[-1] == 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"num_subgoals": 0}, "num_subgoals must be >= 1, got 0; "),
+        ({"num_subgoals": 2, "names": ("a",)}, "names must be one for each of 2 subgoals, got 1"),
+    ],
+)
+def test_wrong_settings_of_a_critic_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        Critic(verdict=mirrored, **settings)

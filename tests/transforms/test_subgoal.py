@@ -118,7 +118,7 @@ class TestArguments:
         assert column(play([1, 1, 1], **settings), key) == pytest.approx(expected)
 
     @pytest.mark.parametrize(("repeatable", "done"), [(False, 1), (True, 0)])
-    def test_repeatable(self, repeatable, done):
+    def test_a_subgoal_that_is_not_repeatable_is_masked_and_ends_its_option(self, repeatable, done):
         steps = play([0, 0, 0], actions=[RIGHT, RIGHT, LEFT], repeatable=repeatable)
         assert steps[-1]["option_done"].item() == done
         assert steps[-1]["subgoal_mask"].tolist() == [[repeatable, True]]
@@ -134,7 +134,7 @@ class TestArguments:
             ({"num_subgoals": 2, "max_option_steps": 0}, "max_option_steps must be >= 1 or None, got 0; "),
         ],
     )
-    def test_wrong_values(self, settings, message):
+    def test_values_out_of_range_are_refused(self, settings, message):
         with pytest.raises(ValueError, match=message):
             SubgoalTransform(**settings)
 
