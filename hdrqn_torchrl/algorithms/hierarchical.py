@@ -17,6 +17,7 @@ from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.learning import LearnerSettings, PhaseOne, phase_monitors
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.transforms import penalties_of_sets
 
 
 def make_hdrqn(
@@ -78,8 +79,8 @@ def make_hdrqn(
         repeatable_subgoals: whether the farthest subgoals can be attained again (then nothing is masked); ``None``: as
             the task states it. Neither is asked of an environment that says itself what is worth choosing
             (``available``).
-        wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one; for all sets of
-            subgoals, or for each from near to far.
+        wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one; one number for the
+            farthest set, or one for each set from near to far.
         hazard_reward: intrinsic reward for meeting the hazard.
         max_option_steps: step limit of an option, among the nearest subgoals.
         sub_hindsight: learn about every subgoal from each sequence (:func:`~hdrqn_torchrl.data.relabel_subgoals`); a
@@ -100,10 +101,8 @@ def make_hdrqn(
         >>> list(make_hdrqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['sub', 'meta']
     """
-    if isinstance(wrong_subgoal_reward, (int, float)):
-        wrong_subgoal_reward = [wrong_subgoal_reward] * (levels - 1)
     _check_version(version, recurrent, meta_input, meta_input_time)
-    _check_levels(levels, wrong_subgoal_reward, meta_hindsight, meta_input_time)
+    _check_levels(levels, meta_hindsight, meta_input_time)
     _check_hindsight(sub, meta, sub_hindsight, meta_hindsight)
     has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", levels=levels)
     reads_last = version == "v2" and meta_input_time == "after_last_observation"
@@ -120,7 +119,7 @@ def make_hdrqn(
         mask_reached=mask_reached,
         repeatable_subgoals=repeatable_subgoals,
         hazard_reward=hazard_reward,
-        penalties=tuple(wrong_subgoal_reward),
+        penalties=tuple(penalties_of_sets(wrong_subgoal_reward, levels - 1)),
         sub_hindsight=sub_hindsight,
         meta_hindsight=meta_hindsight,
         prediction_steps=prediction_steps,
@@ -184,14 +183,9 @@ def _check_version(version: str, recurrent: bool, meta_input: str, meta_input_ti
         )
 
 
-def _check_levels(levels: int, penalties: Sequence[float], meta_hindsight: bool, meta_input_time: str) -> None:
+def _check_levels(levels: int, meta_hindsight: bool, meta_input_time: str) -> None:
     if levels < 2:
         raise ValueError(f"levels must be >= 2, got {levels}; use make_drqn for a flat agent.")
-    if len(penalties) != levels - 1:
-        raise ValueError(
-            f"wrong_subgoal_reward must be one number, or one for each of {levels - 1} sets of subgoals, got "
-            f"{len(penalties)}; give them from near to far."
-        )
     if levels > 2 and meta_hindsight:
         raise ValueError(
             f"meta_hindsight must be False with levels={levels}, got True: an option that is told differently would "
