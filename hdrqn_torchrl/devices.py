@@ -1,4 +1,4 @@
-"""What a device means for the code that runs on it."""
+"""How the code depends on the device that it runs on."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import Tensor
 
 
 def on_host(tensor: Tensor) -> bool:
-    """Whether the host can look into a tensor without waiting for a device.
+    """Whether the host can read a tensor without waiting for a device.
 
-    Where it can, a look may save work (``if mask.any(): ...``). On a GPU it would stop the queue of kernels, and the
-    work is done in any case.
+    On the CPU, reading a value may save work (``if mask.any(): ...``). On a GPU it would stall the queue of kernels, so
+    the work is always done.
     """
     return tensor.device.type == "cpu"
 
@@ -28,7 +28,7 @@ def multiplies_bfloat16(kind: str) -> bool:
 
 
 def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
-    """What autocast makes of matrix products on a tensor's device; ``None`` outside of it."""
+    """The dtype that autocast uses for matrix products on a tensor's device; ``None`` outside autocast."""
     kind = tensor.device.type
     if not torch.amp.is_autocast_available(kind) or not torch.is_autocast_enabled(kind):
         return None
@@ -37,10 +37,10 @@ def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
 
 @contextmanager
 def own_random_numbers(seed: int | None = None) -> Iterator[None]:
-    """Random numbers of torch (on the CPU and on GPUs), numpy and Python go on afterwards as if none had been drawn.
+    """Restores the random states of torch (CPU and GPUs), numpy and Python on exit.
 
     Args:
-        seed: of all of them inside; ``None``: they go on inside, too.
+        seed: seeds all of them on entry; ``None``: they keep their states.
 
     Examples:
         >>> before = torch.get_rng_state()
@@ -66,5 +66,5 @@ def own_random_numbers(seed: int | None = None) -> Iterator[None]:
 
 
 def _generators() -> list[torch.Generator]:
-    """Torch's own, on the host and on the GPUs that are in use; ``torch.manual_seed`` reseeds all of them."""
+    """Torch's default generators, on the host and on GPUs in use: those that ``torch.manual_seed`` seeds."""
     return [torch.default_generator, *(torch.cuda.default_generators if torch.cuda.is_initialized() else ())]

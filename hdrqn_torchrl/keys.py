@@ -1,7 +1,7 @@
 """TensorDict keys shared by environments, modules, replay and losses.
 
-Every class takes its keys as arguments; the names below are only their defaults. Shapes are given
-after the batch dimensions, ``G`` is the number of subgoals and ``H`` the size of an LSTM state.
+Every class takes its keys as arguments; these are the defaults. Shapes leave out the batch dimensions; ``G`` is the
+number of subgoals, ``H`` the size of an LSTM state.
 """
 
 from __future__ import annotations
@@ -12,57 +12,55 @@ from dataclasses import dataclass
 OBSERVATION = "observation"  # [V, V] uint8 cell codes, or [3, 44, 44] uint8 pixels: o_t
 REWARD = "reward"  # [1] float32: total reward of the task
 EXTRINSIC_REWARD = "extrinsic_reward"  # [1] float32: r^ex
-ATTAINED = "attained"  # [G] bool: subgoals reached by this very step
-AVAILABLE = "available"  # [G] bool: subgoals worth choosing now; not every environment has it
+ATTAINED = "attained"  # [G] bool: subgoals reached in this step, whichever was chosen
+AVAILABLE = "available"  # [G] bool: subgoals worth choosing now; optional
 HAZARD = "hazard"  # [1] bool: obstacle hit or life lost in this step
-SUCCESS = "success"  # [1] bool: the whole task was completed by this very step
+SUCCESS = "success"  # [1] bool: the whole task was completed in this step
 IS_INIT = "is_init"  # [1] bool: first step of an episode
-PIXELS, POSITION = (
-    "pixels",
-    "position",
-)  # [height, width, 3] uint8: a whole screen; [2] float32: where the agent is on it
+PIXELS = "pixels"  # [height, width, 3] uint8: the whole screen
+POSITION = "position"  # [2] float32: the agent's place on the screen, x and y in pixels
 
 # Written by the policy.
 ACTION = "action"  # [] int64
-SUBGOAL = "subgoal"  # [] int64: the meta-controller's proposal, honoured where OPTION_INIT
-ACTION_VALUE = "action_value"  # [A] float32: Q-values; [G, A] where every subgoal has its own
-SUBGOAL_VALUE = "subgoal_value"  # [G] float32: Q-values of the meta level where one module has both
+SUBGOAL = "subgoal"  # [] int64: the meta-controller's choice, used only where OPTION_INIT is set
+ACTION_VALUE = "action_value"  # [A] float32: Q-values of the actions; [G, A] for all subgoals at once
+SUBGOAL_VALUE = "subgoal_value"  # [G] float32: Q-values of the subgoals
 SUB_HIDDEN, SUB_CELL = "sub_hidden", "sub_cell"  # [H] float32: h^S
 MEMORY_HIDDEN, MEMORY_CELL = "memory_hidden", "memory_cell"  # [H] float32: v3's memory of the whole episode
-PREVIOUS_ACTION = "previous_action"  # [] int64: action of the step before; meaningless at the first step
-ACTION_EXPLORATION = "repeated_action"  # carried by the exploration of actions: [2] int64, a stretch in progress
-SUBGOAL_EXPLORATION = "subgoal_exploration"  # the same for subgoals, if theirs carries something
+PREVIOUS_ACTION = "previous_action"  # [] int64: action of the step before; meaningless in an episode's first step
+ACTION_EXPLORATION = "repeated_action"  # [2] int64: state that the exploration of actions carries between steps
+SUBGOAL_EXPLORATION = "subgoal_exploration"  # the same for the exploration of subgoals, if it carries any
 META_HIDDEN, META_CELL = "meta_hidden", "meta_cell"  # [H] float32: h^M
 
 # Written by SubgoalTransform.
 OPTION_INIT = "option_init"  # [1] bool: the next policy call starts an option
-ACTIVE_SUBGOAL = "active_subgoal"  # [] int64: g of the option in progress
+ACTIVE_SUBGOAL = "active_subgoal"  # [] int64: subgoal g of the option in progress
 SUBGOAL_MASK = "subgoal_mask"  # [G] bool: subgoals that can be chosen
-OPTION_STEPS = "option_steps"  # [1] int64: k
-OPTION_RETURN = "option_return"  # [1] float32: r^ex collected by the option
-SUBGOAL_REACHED = "subgoal_reached"  # [1] bool
-OPTION_DONE = "option_done"  # [1] bool
-OPTION_TERMINATED = "option_terminated"  # [1] bool
+OPTION_STEPS = "option_steps"  # [1] int64: k, steps of the option so far
+OPTION_RETURN = "option_return"  # [1] float32: discounted r^ex that the option has collected so far
+SUBGOAL_REACHED = "subgoal_reached"  # [1] bool: the active subgoal was reached in this step
+OPTION_DONE = "option_done"  # [1] bool: the option ended, for whatever reason
+OPTION_TERMINATED = "option_terminated"  # [1] bool: it ended because its subgoal was reached or the episode terminated
 INTRINSIC_REWARD = "intrinsic_reward"  # [1] float32: r^in
 
 # Written by hindsight (data/hindsight.py).
 ELIGIBLE = "eligible"  # [1] bool: the step may enter the loss
-HINDSIGHT_SUBGOAL = "hindsight_subgoal"  # [] int64: the subgoal that an option attained or, failing that, pursued
+HINDSIGHT_SUBGOAL = "hindsight_subgoal"  # [] int64: the subgoal that the option attained, or else the one it pursued
 
-# TorchRL's own.
+# TorchRL's own keys.
 DONE, TERMINATED, TRUNCATED = "done", "terminated", "truncated"
 TRAJ_IDS = ("collector", "traj_ids")
-PAD_MASK = ("collector", "mask")  # written by SliceSampler where it pads short trajectories
+PAD_MASK = ("collector", "mask")  # written by SliceSampler when it pads short trajectories
 
 
 @dataclass(frozen=True)
 class OptionKeys:
-    """Names of the entries that concern one set of subgoals: what is attained, and the book of options for them.
+    """Names of the entries that belong to one set of subgoals: what was attained, and its option book.
 
-    Every set but the farthest has a prefix of its own, so that books of several levels lie side by side.
+    Every set except the farthest has its own prefix, so that the books of several levels can exist side by side.
 
     Args:
-        prefix: put before each name; empty for the farthest set, which every hierarchical agent has.
+        prefix: put before each name; empty for the farthest set, which every hierarchical agent uses.
 
     Examples:
         >>> OptionKeys().attained, OptionKeys("rooms").attained
@@ -72,7 +70,7 @@ class OptionKeys:
     prefix: str = ""
 
     def of(self, key: str) -> str:
-        """The name of an entry for this set of subgoals."""
+        """The name of the entry ``key`` for this set of subgoals."""
         return f"{self.prefix}_{key}" if self.prefix else key
 
     @property

@@ -1,4 +1,4 @@
-"""What a builder returns, and what several of them share."""
+"""What builders return, and functions that several of them share."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ Controller = SubController | MetaController | AllSubgoalsPolicy
 
 @dataclass(frozen=True, kw_only=True)
 class Algorithm:
-    """A policy, its learners and all that goes with them.
+    """A policy, its learners, and what training them needs.
 
     Args:
-        policy: chooses at all levels.
-        learners: by name; most algorithms have one per level.
-        explorations: of the levels, by name.
-        make_transforms: makes the transforms that its environment needs.
+        policy: makes the choices of all levels.
+        learners: by name; one per level in most algorithms.
+        explorations: one per level, by the level's name.
+        make_transforms: makes the transforms that the environment needs.
         monitors: what is counted besides the learning, by name.
-        levels: where the levels' decisions are read, from level 0 up, for those who watch.
-        task: what the environment states.
+        levels: entries with the decisions of each level, from level 0 up, for watching.
+        task: what the environment states about itself.
     """
 
     policy: TensorDictModuleBase
@@ -47,13 +47,13 @@ class Algorithm:
     task: Task = field(default_factory=Task)
 
     def transform(self, env: EnvBase) -> TransformedEnv:
-        """The environment as this algorithm sees it."""
+        """The environment with the transforms that this algorithm needs."""
         return TransformedEnv(env, self.make_transforms(), auto_unwrap=True)
 
     def observe(self, batch: TensorDictBase) -> None:
-        """Takes in a collected batch ``[N, T]``: every learner stores it, schedules go on, monitors watch.
+        """Processes a collected batch ``[N, T]``: learners store it, exploration schedules advance, monitors count.
 
-        Updates are then due (:meth:`Learner.updates_due`).
+        Updates may be due afterwards (:meth:`Learner.updates_due`).
         """
         for learner in self.learners.values():
             learner.store(batch)
@@ -65,7 +65,7 @@ class Algorithm:
 
 
 def copies_of(*transforms: Transform) -> Callable[[], Compose]:
-    """A function that makes copies of transforms, for one more environment; it can be sent to another process."""
+    """A function that copies transforms for another environment; it can be pickled for another process."""
     return partial(_copy, transforms)
 
 
@@ -75,7 +75,7 @@ def _copy(transforms: Sequence[Transform]) -> Compose:
 
 @contextmanager
 def settings_named(name: str) -> Iterator[None]:
-    """Complaints about a level's :class:`LearnerSettings` are told under the argument that holds them."""
+    """Puts the name of the argument before errors about fields of its :class:`LearnerSettings`."""
     try:
         yield
     except ValueError as error:
@@ -85,18 +85,18 @@ def settings_named(name: str) -> Iterator[None]:
 
 
 def stored_states(network: Controller, settings: LearnerSettings) -> list[NestedKey]:
-    """The recurrent states that are stored with the steps: all or none.
+    """Entries of the recurrent state to store with each step; empty without ``settings.stored_state``.
 
     Raises:
-        ValueError: if ``settings.stored_state`` is asked of a network without memory.
+        ValueError: if ``settings.stored_state`` is set for a network without memory.
     """
     if settings.stored_state and not network.state_keys:
-        raise ValueError("stored_state must be False without recurrence, got True; such a network has no state.")
+        raise ValueError("stored_state must be False for networks without memory, got True; they have no state.")
     return network.state_keys if settings.stored_state else []
 
 
 def largest_target(setting: float | Literal["unbounded"] | None, stated: float) -> float:
-    """The bound of targets that a setting asks for; ``None``: what the task states."""
+    """The upper bound of targets by a setting; ``None``: the one that the task states."""
     if setting is None:
         return stated
     return math.inf if setting == "unbounded" else setting
@@ -111,18 +111,18 @@ def make_recurrent_loss(
     loss_keys: Mapping[str, NestedKey | None] | None = None,
     prediction_weight: float = 0.1,
 ) -> RecurrentDQNLoss:
-    """The loss of one level, as its settings have it, for sequences that hold each observation once.
+    """The loss of one level, built from its settings, for sequences that store each observation once.
 
     Args:
-        network: the controller that is trained.
+        network: the controller to train.
         settings: how it learns.
         gamma: discount of one environment step.
-        largest_return: bounds the targets where ``settings.max_target`` is ``None``.
-        loss_keys: for :meth:`RecurrentDQNLoss.set_keys`, where they are not the default ones.
-        prediction_weight: of the error of the network's predictor, if it has one.
+        largest_return: upper bound of the targets if ``settings.max_target`` is ``None``.
+        loss_keys: keys that differ from the defaults, for :meth:`RecurrentDQNLoss.set_keys`.
+        prediction_weight: weight of the error of the network's predictor, if it has one.
 
     Raises:
-        ValueError: if ``settings.stored_state`` is asked of a network without memory.
+        ValueError: if ``settings.stored_state`` is set for a network without memory.
     """
     loss = RecurrentDQNLoss(
         network,

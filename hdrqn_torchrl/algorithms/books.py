@@ -18,18 +18,18 @@ def make_books(
     wrong_subgoal_reward: float | Sequence[float] = 0.0,
     repeatable: bool | None = None,
 ) -> list[SubgoalTransform]:
-    """The books in the order in which they stand in the environment: the farther before the nearer.
+    """The books in their order in the environment, from far to near.
 
-    The end of a farther option ends the nearer one, and an option of a nearer set collects the intrinsic reward of the
-    farther one.
+    The end of a farther option ends the nearer one, and options of a nearer set collect the intrinsic reward of the
+    farther option.
 
     Args:
         has: what the environment has.
         gamma: discount inside options.
         max_option_steps: step limit of the nearest options.
-        hazard_reward, wrong_subgoal_reward: of the critic; the latter as in
-            :func:`~hdrqn_torchrl.transforms.penalties_of_sets`.
-        repeatable: whether subgoals of the farthest set can be attained again; ``None``: as the task states it.
+        hazard_reward: the critic's reward for the hazard.
+        wrong_subgoal_reward: the critic's penalties (:func:`~hdrqn_torchrl.transforms.penalties_of_sets`).
+        repeatable: whether subgoals of the farthest set can be attained again; ``None``: as the task states.
     """
     penalties = penalties_of_sets(wrong_subgoal_reward, len(has.subgoals))
     books: list[SubgoalTransform] = []

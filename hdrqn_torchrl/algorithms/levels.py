@@ -1,7 +1,7 @@
-"""The levels of an agent: what each chooses among, and what it pursues (design rule of all hierarchies here).
+"""The levels of an agent: what each chooses among, and what it pursues.
 
-Level 0 chooses primitive actions; level l > 0 chooses among the l-th set of subgoals, from near to far. What a level
-pursues is a choice of the level above; the top level pursues the task itself.
+Level 0 chooses primitive actions; level l > 0 chooses among the l-th set of subgoals, from near to far. Each level
+pursues the subgoal that the level above has chosen; the top level pursues the task itself.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ class Level:
     """One level of an agent.
 
     Args:
-        name: ``"sub"`` (chooses actions), ``"meta"`` (chooses among the farthest subgoals), or the prefix of the nearer
-            set that it chooses among.
+        name: ``"sub"`` (chooses actions), ``"meta"`` (chooses among the farthest subgoals), or else the prefix of the
+            set of subgoals that it chooses among.
         num_choices: number of actions or subgoals.
         choices: the set of subgoals that it chooses among; ``None``: primitive actions.
-        pursues: the set of subgoals that it is told to reach; ``None``: the whole task.
+        pursues: the set of subgoals that it can be given; ``None``: the whole task.
 
     Examples:
         >>> rooms, goals = SubgoalSet(names=("a", "b", "c"), prefix="rooms"), SubgoalSet(names=("x", "y"))
@@ -36,16 +36,16 @@ class Level:
 
     @property
     def num_conditions(self) -> int:
-        """How many subgoals it can be told to reach; 0 at the top."""
+        """Number of subgoals that it can be given; 0 at the top."""
         return 0 if self.pursues is None else len(self.pursues)
 
 
 def make_levels(num_actions: int, subgoals: Sequence[SubgoalSet]) -> tuple[Level, ...]:
-    """The levels of an agent that pursues some sets of subgoals, from level 0 up.
+    """The levels of an agent, from level 0 up.
 
     Args:
-        num_actions: of the environment.
-        subgoals: sets from near to far; none makes a flat agent.
+        num_actions: number of the environment's actions.
+        subgoals: the sets of subgoals that it pursues, from near to far; empty: a flat agent.
     """
     choices = [None, *subgoals]
     pursued = [*subgoals, None]

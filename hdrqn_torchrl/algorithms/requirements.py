@@ -16,26 +16,26 @@ from hdrqn_torchrl.modules import Architecture
 from hdrqn_torchrl.transforms.entries import Entries, describe
 
 _REMEDIES: tuple[tuple[type[TensorSpec], str], ...] = (
-    (MultiOneHot, "give each combination of its parts one number, and pass categorical_action_encoding=True"),
+    (MultiOneHot, "number the combinations of its parts, and pass categorical_action_encoding=True"),
     (OneHot, "pass categorical_action_encoding=True to GymEnv or GymWrapper"),
-    (MultiCategorical, "give each combination of its parts one number"),
-    (Bounded, "make it discrete, with torchrl.envs.transforms.ActionDiscretizer for instance"),
-    (Binary, "give each combination of its bits one number"),
+    (MultiCategorical, "number the combinations of its parts"),
+    (Bounded, "make it discrete, for instance with torchrl.envs.transforms.ActionDiscretizer"),
+    (Binary, "number the combinations of its bits"),
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Requirements:
-    """What a builder needs to know of its environment.
+    """What a builder needs to know about its environment.
 
     Args:
         num_envs: N.
-        observation: spec of ``[N, ...]``.
-        num_actions: how many there are.
-        subgoals: the sets of subgoals that the agent pursues, from near to far; none for a flat agent.
-        available_keys: for each of them, the entry that tells which are worth choosing, or ``None``.
-        hazard_key: an entry that not every environment has, or ``None``.
-        task: what the environment states.
+        observation: spec of the observation ``[N, ...]``.
+        num_actions: number of actions.
+        subgoals: the sets of subgoals that the agent pursues, from near to far; empty for a flat agent.
+        available_keys: for each set, the entry that tells which subgoals are worth choosing, or ``None``.
+        hazard_key: the entry that tells of the hazard; ``None`` if the environment or the agent has none.
+        task: what the environment states about itself.
     """
 
     num_envs: int
@@ -68,16 +68,16 @@ class Requirements:
 
 
 def check_environment(env: EnvBase, architecture: Architecture, *, builder: str, levels: int) -> Requirements:
-    """Reads the specs of an environment.
+    """Checks the specs of an environment and collects what a builder needs to know.
 
     Args:
         env: bare environment.
-        architecture: what reads the observation.
-        builder: named in the error.
-        levels: of the agent; it pursues the last ``levels - 1`` sets of subgoals of the task.
+        architecture: the networks that will read the observation.
+        builder: name of the builder, for the error.
+        levels: number of the agent's levels; it pursues the task's last ``levels - 1`` sets of subgoals.
 
     Raises:
-        ValueError: naming everything that is missing or wrong, and what the environment has; or if the task has fewer
+        ValueError: with everything that is missing or wrong and what the environment has, or if the task has too few
             sets of subgoals.
 
     Examples:
@@ -119,17 +119,17 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
 
 
 def _check_levels(levels: int, task: Task) -> None:
-    """Refuses an agent of more levels than the task has sets of subgoals for."""
+    """Refuses more levels than the task has sets of subgoals for."""
     most = max(1, len(task.subgoals)) + 1
     if not 1 <= levels <= most:
         raise ValueError(
             f"levels must lie in [1, {most}], got {levels}: the task states {len(task.subgoals)} sets of subgoals, and "
-            "each level above the first chooses among one; state more of them (Task.subgoals)."
+            "each level above the first chooses among one of them; use fewer levels, or add sets to Task.subgoals."
         )
 
 
 def _subgoals(entries: Entries, task: Task, number: int) -> tuple[SubgoalSet, ...]:
-    """The farthest sets of subgoals, as many as ``number``; their ``attained`` is checked."""
+    """The ``number`` farthest sets of subgoals, after checking their ``attained`` entries."""
     if not number:
         return ()
     stated = task.subgoals[-number:]
@@ -145,7 +145,7 @@ def _subgoals(entries: Entries, task: Task, number: int) -> tuple[SubgoalSet, ..
 def _check_batch(entries: Entries) -> None:
     if len(entries.batch_size) != 1:
         remedy = (
-            "collect several at a time, with SerialEnv(16, make_env)"
+            "use several environments, for instance SerialEnv(16, make_env)"
             if not entries.batch_size
             else "use one batch of environments, not a batch of batches"
         )
@@ -153,7 +153,7 @@ def _check_batch(entries: Entries) -> None:
 
 
 def _check_resets(env: EnvBase, entries: Entries) -> None:
-    """TorchRL reads what Gymnasium's vectors report of a last step in SAME_STEP mode for plain observations only."""
+    """In SAME_STEP mode, TorchRL reads an episode's last step from Gymnasium's vectors for plain observations only."""
     observed = set(env.observation_spec.keys(True, True))
     while isinstance(env, TransformedEnv):
         env = env.base_env
@@ -162,8 +162,8 @@ def _check_resets(env: EnvBase, entries: Entries) -> None:
     mode = (env._env.metadata or {}).get("autoreset_mode")
     if getattr(mode, "name", None) == "SAME_STEP" and observed != {keys.OBSERVATION}:
         entries.problems.append(
-            "a vector of Gymnasium environments with more entries than the observation must leave resets to TorchRL, "
-            "got autoreset_mode=SAME_STEP; use AutoresetMode.DISABLED"
+            "the autoreset_mode of a vector of Gymnasium environments that has more entries than the observation must "
+            "be DISABLED, got SAME_STEP; pass AutoresetMode.DISABLED"
         )
 
 
@@ -180,10 +180,10 @@ def _check_observation(entries: Entries, architecture: Architecture) -> None:
 
 def _check_action(entries: Entries) -> None:
     spec = entries.specs.get(keys.ACTION)
-    rule = f"{keys.ACTION!r} must be one number of n, {list(entries.batch_size)} int64 (Categorical)"
+    rule = f"{keys.ACTION!r} must be one integer below n, {list(entries.batch_size)} int64 (Categorical)"
     if spec is None:
         entries.problems.append(f"{rule}, it is missing")
     elif type(spec) is not Categorical or spec.shape != entries.batch_size:
         remedies = (text for kind, text in _REMEDIES if isinstance(spec, kind))
-        remedy = next(remedies, "let it have the environment's batch size")
+        remedy = next(remedies, "give it the environment's batch size")
         entries.problems.append(f"{rule}, got {describe(spec)}; {remedy}")

@@ -50,9 +50,9 @@ V3_LEARNER = LearnerSettings(
 )
 """Defaults of :func:`make_v3`."""
 LONGEST_SEQUENCE = 200
-"""Steps of the longest episode that v3 replays as a whole unless it is told to."""
+"""Longest episode, in steps, that v3 replays as a whole by default."""
 SHORT_SEQUENCE = 32
-"""Steps of v3's sequences that begin anywhere, unless it is told; so it learned Montezuma's Revenge."""
+"""Default length, in steps, of sequences that begin anywhere; v3 learned Montezuma's Revenge with it."""
 
 
 def make_v3(
@@ -83,46 +83,47 @@ def make_v3(
     prediction_steps: int = 4,
     prediction_weight: float = 0.1,
 ) -> Algorithm:
-    """hDRQNv3, this project's own agent: one memory for the whole episode, all subgoals learn from every step.
+    """hDRQNv3, this project's own agent: one memory for the whole episode, and all subgoals learn from every step.
 
     Args:
-        env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``,
-            ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available`` and ``success`` are
-            used where they are.
-        architecture: where the features come from.
-        levels: how many levels choose: the agent pursues the last ``levels - 1`` sets of subgoals that the task states
+        env: bare environment with batch size ``[N]``; of the entries in :mod:`hdrqn_torchrl.keys` it needs
+            ``observation``, ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available``
+            and ``success`` are used if present.
+        architecture: provides the feature extractor.
+        levels: number of levels. The agent pursues the last ``levels - 1`` sets of subgoals that the task states
             (:class:`~hdrqn_torchrl.envs.Task`). 1: a flat agent with the same memory and loss, which learns from the
             task's total reward.
-        learner: how it learns. ``sampling`` must be ``"episode_starts"`` or ``"whole_episodes"``, then ``slice_len``
-            should cover an episode; with ``stored_state``, sequences are shorter and begin anywhere.
-            ``slice_len=None``: a whole episode as the task states it, up to 200 steps; where it may be longer, or the
-            task does not say, ``"episode_starts"`` becomes sequences of 32 steps from anywhere (``sampling="steps"``,
-            with ``stored_state`` and a ``burn_in`` of 0.25).
-        sub_exploration, meta_exploration: schedules; the default sub level repeats random actions.
-        middle_exploration: schedule of the levels between, a copy for each; ``None``: that of the meta level.
-        phase_one: how long subgoals are chosen at random (the meta level learns meanwhile, as its head learns from
-            every step); ``None``: not at all.
+        learner: how it learns. Without ``stored_state``, ``sampling`` must be ``"episode_starts"`` or
+            ``"whole_episodes"``, and ``slice_len`` should cover an episode; with it, shorter sequences may begin
+            anywhere. ``slice_len=None``: the longest episode that the task states, up to 200 steps; if episodes may be
+            longer or the task does not say, ``"episode_starts"`` is replaced by sequences of 32 steps from anywhere
+            (``sampling="steps"``, ``stored_state=True``, ``burn_in=0.25``).
+        sub_exploration, meta_exploration: exploration schedules; the default sub level repeats random actions.
+        middle_exploration: schedule of the levels in between, copied for each; ``None``: that of the meta level.
+        phase_one: how long subgoals are chosen at random (the meta level learns meanwhile, because its head learns from
+            every step); ``None``: never.
         memory_size: H, size of the LSTM.
-        head_size: units of the heads' hidden layers.
-        joint: whether the meta level trains the memory, too; ``False``: it reads the memory only, and its head has an
-            optimiser of its own.
-        meta_learning_rate: of that optimiser, following the same schedule; ``None``: ``learner.learning_rate``.
+        head_size: number of units in the hidden layer of each head.
+        joint: whether the meta level also trains the memory; ``False``: it only reads it, and its head has its own
+            optimiser.
+        meta_learning_rate: learning rate of that optimiser, with the same schedule; ``None``:
+            ``learner.learning_rate``.
         sub_gamma, meta_gamma, middle_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, bonus_reward,
             prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
-        wrong_subgoal_reward: of the levels below the top, for attaining another subgoal than the one in question; one
-            number for the farthest set, or one for each set from near to far. Below 0 it keeps the agent from spoiling
-            what comes later (the grid tasks have -0.5); but where one subgoal is needed for another, such as the key
-            for the door, it forbids the only way: docs/v3.md has what was measured.
-        max_option_steps: step limit of an option of the nearest subgoals.
-        max_meta_target: largest return of the task there can be; the meta level's targets are cut off above it.
-            ``None``: what the task states, if it states one; ``"unbounded"``: they are not cut off.
-        prediction_steps: how many steps ahead, at most, the memory learns to predict what will be seen
-            (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: not at all.
+        wrong_subgoal_reward: reward of the levels below the top for attaining a subgoal other than the one pursued; one
+            number for the farthest set, or one for each set from near to far. A penalty keeps the agent from collecting
+            too early what it needs later (the grid tasks have -0.5). If one subgoal is needed for another, such as the
+            key for the door, it blocks the only way; docs/v3.md has measurements.
+        max_option_steps: step limit of options of the nearest subgoals.
+        max_meta_target: largest possible return of the task; the meta level's targets are clipped to it. ``None``: what
+            the task states, if anything; ``"unbounded"``: no clipping.
+        prediction_steps: largest number of steps ahead for which the memory learns to predict the observation
+            (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: no prediction.
 
     Raises:
-        ValueError: if the environment lacks something, or states fewer sets of subgoals than ``levels`` need; if
-            ``learner.sampling`` begins in mid-episode without ``stored_state``, where the memory would start empty; or
-            if ``learner`` has targets of its own (``max_target``, ``trace_decay``, ``n_step``).
+        ValueError: if the environment lacks something or states too few sets of subgoals for ``levels``; if sequences
+            may begin in mid-episode without ``stored_state``, so that the memory would wrongly start empty; or if
+            ``learner`` sets what the loss decides itself (``max_target``, ``trace_decay``, ``n_step``).
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -135,7 +136,7 @@ def make_v3(
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
     if bonus_reward and levels > 1:
         raise ValueError(
-            f"bonus_reward must be 0 with levels={levels}, got {bonus_reward}: their critic rewards subgoals already."
+            f"bonus_reward must be 0 with levels={levels}, got {bonus_reward}; their critic already rewards subgoals."
         )
     has = check_environment(env, architecture, builder="make_v3", levels=levels)
     learner = _with_sequences(learner, has.task)
@@ -202,21 +203,21 @@ def make_v3(
 
 
 def _check_learner(learner: LearnerSettings) -> None:
-    """Refuses settings that mean something else for v3, or nothing."""
+    """Refuses settings that have no meaning for v3, or another one."""
     if learner.sampling not in FROM_STARTS and not learner.stored_state:
         raise ValueError(
             f"sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its memory "
-            "lasts a whole episode and would start empty in the middle of one; or use stored_state=True."
+            "lasts a whole episode and would start empty in mid-episode; use one of them, or stored_state=True."
         )
     if learner.trace_decay or learner.n_step > 1:
         raise ValueError(
             f"learner.trace_decay and n_step must be left at 0 and 1 for v3, got {learner.trace_decay} and "
-            f"{learner.n_step}; its loss has a trace_decay of its own, an argument of v3."
+            f"{learner.n_step}; use v3's own argument trace_decay."
         )
     if learner.max_target is not None:
         raise ValueError(
-            f"max_target must be None for v3, got {learner.max_target}; its levels are bounded separately: those below "
-            "the top by the reward for reaching the subgoal, the meta level by max_meta_target."
+            f"max_target must be None for v3, got {learner.max_target}; the meta level's targets are bounded by "
+            "max_meta_target, those of the other levels by the reward for reaching the subgoal."
         )
 
 
@@ -248,7 +249,7 @@ def _make_network(
 
 
 def _make_extract(loss: AllSubgoalsLoss, states: list[NestedKey]) -> StepSelector:
-    """Stores what the loss reads: an observation once, as the step that follows values what each led to."""
+    """Stores what the loss reads, each observation only once: the next step's observation is the step's outcome."""
     after = [key[1] for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
     root = [key for key in loss.in_keys if not (isinstance(key, tuple) and key[0] == "next")]
     return StepSelector(
@@ -258,17 +259,17 @@ def _make_extract(loss: AllSubgoalsLoss, states: list[NestedKey]) -> StepSelecto
 
 
 def _largest_return(has: Requirements, bonus_reward: float) -> float:
-    """The largest return that the top level can collect, as far as the task states it."""
+    """The largest return of the top level, as far as the task states it."""
     if has.subgoals:
         return has.task.largest_extrinsic_return
     return math.inf if bonus_reward else has.task.largest_return
 
 
 def _with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
-    """The settings with sequences as the task needs them, unless they say themselves how long these are.
+    """The settings with a ``slice_len`` that suits the task, if they have none.
 
     Raises:
-        ValueError: if whole episodes are asked for and may be very long.
+        ValueError: if ``sampling="whole_episodes"`` and episodes may be too long.
     """
     if learner.slice_len is not None:
         return learner
@@ -279,13 +280,13 @@ def _with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
     length = "of unknown length" if task.max_steps is None else f"of up to {task.max_steps} steps"
     if learner.sampling == "whole_episodes":
         raise ValueError(
-            f"slice_len must be a number with sampling='whole_episodes' and episodes {length}, got None; or use "
-            "sampling='steps' with stored_state=True."
+            f"slice_len must be a number with sampling='whole_episodes' and episodes {length}, got None; give one, or "
+            "use sampling='steps' with stored_state=True."
         )
     warnings.warn(
         f"v3 learns from episodes {length} in sequences of {SHORT_SEQUENCE} steps that begin anywhere, from stored "
-        "states (sampling='steps', stored_state=True, burn_in=0.25); give slice_len to have them begin where an "
-        "episode does.",
+        "states (sampling='steps', stored_state=True, burn_in=0.25); give slice_len for sequences from the start of "
+        "episodes.",
         stacklevel=3,
     )
     return replace(learner, slice_len=SHORT_SEQUENCE, sampling="steps", stored_state=True, burn_in=0.25)

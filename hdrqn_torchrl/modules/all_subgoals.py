@@ -1,4 +1,4 @@
-"""hDRQNv3's policy: all levels choose from the values of one network (:mod:`.all_subgoals_network`)."""
+"""hDRQNv3's policy: all levels choose by the Q-values of one network (:mod:`.all_subgoals_network`)."""
 
 from __future__ import annotations
 
@@ -27,25 +27,26 @@ from hdrqn_torchrl.modules.exploration_checks import (
 class AllSubgoalsPolicy(TensorDictModuleBase):
     """All levels of hDRQNv3 as one TensorDict module.
 
-    Acting takes one step, from the top level down: where an option of a level starts it chooses a subgoal, by the
-    values for what the level above pursues, elsewhere the subgoal is kept; the action is chosen by the values of the
-    nearest subgoal. Learning (inside ``set_recurrent_mode(True)``) writes the values of all steps, subgoals and
-    actions, and the memory's output, from the memory at the first step of a sequence if there is one, else from zero.
+    In acting, one step goes from the top level down. Where an option of a level starts, the level chooses a subgoal by
+    its Q-values for what the level above pursues; elsewhere it keeps its subgoal. The action is chosen by the Q-values
+    for the nearest subgoal. In learning (inside ``set_recurrent_mode(True)``), the module writes the Q-values of all
+    steps, subgoals and actions, and the output of the memory; sequences start from the stored state of the memory if
+    there is one, else from zero.
 
     Args:
         network: the network.
         sub_exploration: choice of the action; ``None`` is always greedy.
         meta_exploration: choice of the farthest subgoal; ``None`` is always greedy.
-        middle_explorations: choice of the nearer subgoals, from near to far; none: always greedy.
-        subgoal_keys: entries of each set of subgoals, from near to far; as many as the network has sets.
-        observation_key, previous_action_key, init_key: read.
-        action_key, action_value_key: written.
+        middle_explorations: choice of the nearer subgoals, from near to far; empty: always greedy.
+        subgoal_keys: entries of each of the network's sets of subgoals, from near to far.
+        observation_key, previous_action_key, init_key: entries that are read.
+        action_key, action_value_key: entries that are written.
         hidden_key, cell_key: LSTM state ``[H]``.
-        exploration_key: what the exploration of actions carries, if anything.
+        exploration_key: state that the exploration of actions carries, if any.
 
     Raises:
-        ValueError: if an exploration is none, two are one, one can't choose subgoals, or there are not as many as the
-            network has levels.
+        ValueError: if an exploration is not an ``EpsilonGreedy``, serves two levels or can't choose subgoals, or if
+            their number or that of ``subgoal_keys`` does not fit the network.
 
     Examples:
         >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
@@ -79,8 +80,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         super().__init__()
         if len(subgoal_keys) != len(network.num_subgoals):
             raise ValueError(
-                f"subgoal_keys must be one for each of the network's {len(network.num_subgoals)} sets of subgoals, got "
-                f"{len(subgoal_keys)}; give them from near to far."
+                f"subgoal_keys must have one item for each of the network's {len(network.num_subgoals)} sets of "
+                f"subgoals, got {len(subgoal_keys)}; give them from near to far."
             )
         self.network = network
         self.sub_exploration = exploration_or_greedy(sub_exploration, "sub_exploration")
@@ -96,7 +97,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         self.action_key, self.action_value_key = action_key, action_value_key
         self.hidden_key, self.cell_key, self.exploration_key = hidden_key, cell_key, exploration_key
         self.writes_values = False
-        """Whether acting, too, writes the Q-values that it chose by; for those who watch."""
+        """Whether acting also writes the Q-values that choices were made by, for watching."""
         self.state_keys: list[NestedKey] = [hidden_key, cell_key]
         self.mask_keys = [each.subgoal_mask for each in subgoal_keys]
         self._carried = carried_by(self.sub_exploration, exploration_key)
@@ -121,16 +122,16 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
 
     @property
     def subgoal_explorations(self) -> list[EpsilonGreedy]:
-        """Of the levels that choose subgoals, from near to far."""
+        """Explorations of the levels that choose subgoals, from near to far."""
         return [*self.middle_explorations, *([self.meta_exploration] if self.network.num_subgoals else [])]
 
     @property
     def value_keys(self) -> list[NestedKey]:
-        """Q-values of each level, written in learning: ``[C, X]``."""
+        """Entries with the Q-values of each level ``[C, X]``, written in learning."""
         return [self.action_value_key, *(each.subgoal_value for each in self.subgoal_keys)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
-        """Puts an empty memory into every reset."""
+        """A transform that adds an empty memory to every reset."""
         state = Unbounded(shape=(self.network.hidden_size,))
         carried = {self.hidden_key: state, self.cell_key: state.clone()}
         carried[self.previous_action_key] = Categorical(self.network.num_actions, shape=(), dtype=torch.int64)
@@ -163,10 +164,13 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
     def _choose_subgoals(
         self, values: Sequence[Tensor], masks: Sequence[Tensor], tensordict: TensorDictBase
     ) -> tuple[Tensor | None, Tensor | None]:
-        """From the top down, each level for what the one above pursues; the nearest subgoal and where its option
-        starts, ``[*]`` each."""
+        """Chooses from the top down, each level given the choice of the level above.
+
+        Returns:
+            The nearest subgoal, and where its option starts, ``[*]`` each.
+        """
         subgoal: Tensor | None = None
-        began: Tensor | None = None  # where what is pursued was chosen
+        began: Tensor | None = None  # where the level above has just chosen
         levels = list(zip(values, masks, self.subgoal_keys, self.subgoal_explorations, strict=True))
         for value, mask, names, exploration in reversed(levels):
             wanted = value.squeeze(-2) if subgoal is None else values_of(value, subgoal)
@@ -180,19 +184,19 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
 
 
 def _middle(explorations: Sequence[EpsilonGreedy], number: int) -> list[EpsilonGreedy]:
-    """One exploration for each middle level."""
+    """The explorations of the middle levels; greedy ones if none are given."""
     number = max(number, 0)
     given = list(explorations) or [EpsilonGreedy(0.0, 0.0) for _ in range(number)]
     if len(given) != number:
         raise ValueError(
-            f"middle_explorations must be one for each of {number} middle levels, got {len(given)}; give them from "
-            "near to far, or none for greedy choices."
+            f"middle_explorations must have one item for each of {number} middle levels, got {len(given)}; give them "
+            "from near to far, or none for greedy choices."
         )
     return [exploration_or_greedy(each, f"middle_explorations[{index}]") for index, each in enumerate(given)]
 
 
 def values_of(action_value: Tensor, subgoal: Tensor) -> Tensor:
-    """The values ``[*, A]`` of one subgoal ``[*]`` out of all ``[*, G, A]``."""
+    """Selects the values ``[*, A]`` of one subgoal ``[*]`` from those of all ``[*, G, A]``."""
     index = subgoal[..., None, None].expand(*subgoal.shape, 1, action_value.shape[-1])
     return action_value.gather(-2, index).squeeze(-2)
 

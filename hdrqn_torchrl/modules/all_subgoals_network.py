@@ -1,8 +1,8 @@
-"""hDRQNv3's network: one memory of the whole episode, the values of all levels on it.
+"""hDRQNv3's network: one memory for the whole episode, and the Q-values of all levels computed from it.
 
-The LSTM reads observation and previous action, not the subgoal, and goes on through the options of an episode. On
-its output stands one dueling head for each level. One pass gives the values of all levels, for everything that they can
-be told to reach, in acting and learning alike.
+The LSTM reads the observation and the previous action but not the subgoal, and is not reset between options. Each level
+has a dueling head on its output. In acting and in learning, one pass computes the Q-values of all levels for every
+subgoal that they can be given.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from hdrqn_torchrl.modules.sizes import check_size
 
 
 class AllSubgoalsNetwork(nn.Module):
-    """Q-values of all levels from one memory: of every choice, for everything that the level can be told to reach.
+    """Q-values of all levels from one memory: of every choice, for every subgoal that the level can be given.
 
     Level 0 chooses among A actions, level l > 0 among :math:`X_l` subgoals. What a level pursues is one of the choices
     of the level above (:math:`C_l = X_{l+1}`); the top level pursues the task (:math:`C = 1`).
@@ -29,11 +29,11 @@ class AllSubgoalsNetwork(nn.Module):
     Args:
         features: maps observations to vectors of ``features.out_features``.
         num_actions: A.
-        num_subgoals: size of each set of subgoals, from near to far, or of the only one; none: a flat agent.
+        num_subgoals: size of each set of subgoals, from near to far, or of the only one; empty: a flat agent.
         hidden_size: H, size of the LSTM.
-        head_size: units of the hidden layer of each level's heads.
-        joint: whether the top level, too, trains the memory; ``False``: it only reads it.
-        predictor: a second task for the memory; not used in acting.
+        head_size: number of units in the hidden layer of each head.
+        joint: whether the top level also trains the memory; ``False``: it only reads it.
+        predictor: predicts observations from the memory, as an auxiliary task; not used for acting.
 
     Raises:
         ValueError: if a size is not positive.
@@ -74,7 +74,7 @@ class AllSubgoalsNetwork(nn.Module):
         self.register_buffer("_one_hot", torch.eye(num_actions), persistent=False)
         self.memory = nn.LSTM(features.out_features + num_actions, hidden_size, batch_first=True)
         self._conditions = [*subgoals, 1]
-        # Which subgoals are left decides which one pays; the memory need not count them.
+        # What a subgoal is worth depends on which are left: the heads read that, so the memory need not keep track.
         inputs = [hidden_size, *(hidden_size + number for number in subgoals)]
         outputs = [
             conditions * (1 + choices)
@@ -107,13 +107,13 @@ class AllSubgoalsNetwork(nn.Module):
     def step(
         self, observation: Tensor, previous_action: Tensor, init: Tensor, masks: Sequence[Tensor], state: State
     ) -> tuple[tuple[Tensor, ...], State]:
-        """One decision.
+        """Q-values at one step.
 
         Args:
             observation: ``[*, ...]``.
-            previous_action: ``[*]`` int64; not read where ``init``.
+            previous_action: ``[*]`` int64; not read where ``init`` is set.
             init: ``[*]`` bool; where set, the state restarts from zero.
-            masks: for each set of subgoals, those that can be chosen ``[*, G]`` bool.
+            masks: for each set, the subgoals that can be chosen, ``[*, G]`` bool.
             state: LSTM state, two tensors ``[*, H]``.
 
         Returns:
@@ -143,7 +143,7 @@ class AllSubgoalsNetwork(nn.Module):
             state: LSTM state before the first step, two tensors ``[B, H]``; zero if not given.
 
         Returns:
-            Q-values of each level ``[B, T, C, X]``, and the memory's output ``[B, T, H]`` they were read from.
+            Q-values of each level ``[B, T, C, X]``, and the output of the memory ``[B, T, H]``.
         """
         state = self.initial_state(len(init)) if state is None else state
         if not on_host(init):

@@ -1,4 +1,4 @@
-"""The two network families that every algorithm can be built from."""
+"""The two families of networks; every algorithm can be built from either."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, ImageDecoder,
 from hdrqn_torchrl.modules.q_network import QNetwork
 from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
-_LARGEST_FLOAT = 10.0  # what bounds of images in float32 are taken to be of about 1
+_LARGEST_FLOAT = 10.0  # images in float32 with bounds above this are not taken to be scaled to about 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Architecture:
-    """What a Q-network is made of.
+    """How to build a Q-network.
 
     Args:
         hidden_size: H, size of the recurrent layer.
         observation_features: makes the feature extractor for an observation spec.
-        vector_features: makes the feature extractor for a vector of given size (v2's meta-controller).
-        gate_features: whether the subgoal scales the features beside being appended to them.
-        observation_problem: for an observation's spec and its shape without the batch, what it must be if it can't be
-            read, and what helps; ``None``: it can be.
+        vector_features: makes the feature extractor for a vector of a given size (v2's meta-controller).
+        gate_features: whether the subgoal also scales the features, besides being appended to them.
+        observation_problem: takes an observation's spec and its shape without the batch dimensions; returns what an
+            observation must be and what to do about it, or ``None`` if this one can be read.
     """
 
     hidden_size: int
@@ -55,9 +55,9 @@ class Architecture:
         recurrent: bool = True,
         prediction_steps: int = 0,
     ) -> QNetwork:
-        """A Q-network for an observation spec or a vector of given size.
+        """A Q-network for an observation spec or a vector of a given size.
 
-        Its memory can learn to predict up to ``prediction_steps`` steps ahead what will be seen.
+        With ``prediction_steps`` its memory also learns to predict observations up to that many steps ahead.
         """
         check_size("prediction_steps", prediction_steps, "4, or 0 for no prediction", least=0)
         predictor = None
@@ -77,11 +77,11 @@ class Architecture:
 def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Architecture:
     """The paper's networks: 44x44x3 image, 4 conv + ReLU (or 4 dense + ReLU on a vector) -> 256 -> LSTM -> dueling.
 
-    Cells are drawn as an image inside the network.
+    Cell codes are drawn as an image inside the network.
 
     Args:
         hidden_size: H, size of the LSTM.
-        gate_features: whether the subgoal scales the features beside being appended to them.
+        gate_features: whether the subgoal also scales the features, besides being appended to them.
     """
 
     def observation_features(spec: TensorSpec) -> Features:
@@ -106,7 +106,7 @@ def compact_network(
     Args:
         hidden_size: H, size of the LSTM.
         widths: sizes of the dense layers, at least one.
-        gate_features: whether the subgoal scales the features beside being appended to them.
+        gate_features: whether the subgoal also scales the features, besides being appended to them.
 
     Raises:
         ValueError: if a size is not positive.
@@ -128,14 +128,14 @@ def compact_network(
 
 
 def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | None:
-    """What an observation must be for :func:`paper_network` and :func:`compact_network`, and what helps.
+    """Checks that :func:`paper_network` and :func:`compact_network` can read an observation.
 
     Args:
-        spec: its spec.
-        shape: of it, without the batch.
+        spec: spec of the observation.
+        shape: shape of the observation without the batch dimensions.
 
     Returns:
-        ``None`` if it can be read.
+        What the observation must be and what to do about it; ``None`` if it can be read.
     """
     square = len(shape) >= 2 and shape[-1] == shape[-2]
     if type(spec) is Categorical and not spec.dtype.is_floating_point and len(shape) == 2 and square:
@@ -146,10 +146,10 @@ def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | N
     if image and len(shape) == 3 and square and shape[-1] >= SMALLEST_IMAGE:
         return None
     return (
-        "a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] of "
+        "a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] with "
         f"S >= {SMALLEST_IMAGE} pixels, uint8 or float32 of about 1",
-        "integers are codes where their spec is Categorical, and ToTensorImage and Resize make such images; for "
-        "anything else give Architecture(observation_features=...) a feature extractor",
+        "use a Categorical spec for cell codes, ToTensorImage and Resize for images, and for anything else an "
+        "Architecture with your own observation_features",
     )
 
 
@@ -161,15 +161,15 @@ def is_grid(spec: TensorSpec) -> bool:
 def observation_predictor(
     spec: TensorSpec, hidden_size: int, num_actions: int, max_steps: int, width: int = 128
 ) -> ObservationPredictor:
-    """A predictor for an observation spec: it guesses cell codes, or a coarse image.
+    """A predictor for an observation spec ``[N, ...]``: of cell codes, or of a coarse image.
 
     Raises:
-        ValueError: if the observation ``[N, ...]`` is neither.
+        ValueError: if the observation is neither cell codes nor an image.
     """
     if spec.ndim != (3 if is_grid(spec) else 4):
         raise ValueError(
-            f"prediction_steps must be 0 where the observation is neither cell codes [V, V] nor an image, got "
-            f"{max_steps} for {list(spec.shape)}; such an observation can't be guessed."
+            f"prediction_steps must be 0 if the observation is neither cell codes [V, V] nor an image, got "
+            f"{max_steps} for {list(spec.shape)}; there is no decoder for it."
         )
 
     def decoder(in_features: int) -> Decoder:

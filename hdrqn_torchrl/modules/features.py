@@ -1,7 +1,7 @@
-"""Feature extractors: what stands between an observation and the recurrent layer.
+"""Feature extractors, the layers between an observation and the recurrent layer.
 
-Each is a plain module that maps ``[*, ...]`` to ``[*, out_features]`` for any number of leading dimensions,
-so that one instance serves single steps and whole sequences.
+Each maps ``[*, ...]`` to ``[*, out_features]`` for any number of leading dimensions, so that the same module handles
+single steps and whole sequences.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
 _USUAL_VIEW = 5
 SMALLEST_IMAGE = 33
-"""Side in pixels of the smallest image that four convolutions can read."""
+"""Side, in pixels, of the smallest image that the four convolutions accept."""
 
 
 class Features(nn.Module):
-    """A feature extractor: it tells how many features it makes."""
+    """Base class of feature extractors; ``out_features`` is the number of features."""
 
     out_features: int
 
 
 class CellsToImage(nn.Module):
-    """Draws cell codes as a colour image, inside the network: replay keeps 25 bytes a view, not 5,808.
+    """Draws cell codes as a colour image inside the network, so that replay stores 25 bytes per view, not 5,808.
 
     Args:
         view: side of the window in cells.
@@ -48,7 +48,7 @@ class CellsToImage(nn.Module):
         super().__init__()
         _check_grid(view, num_codes)
         check_size("size", size, 44)
-        self.register_buffer("_cells", nearest_cell(size, view), persistent=False)  # of each row, of each column
+        self.register_buffer("_cells", nearest_cell(size, view), persistent=False)  # for each row and each column
         self.register_buffer("_colours", palette(num_codes).float() / 255, persistent=False)
 
     def forward(self, cells: Tensor) -> Tensor:
@@ -82,19 +82,19 @@ class ConvFeatures(Features):
         channels: tuple[int, int, int, int] = (32, 64, 64, 64),
     ) -> None:
         super().__init__()
-        check_size("in_channels", in_channels, "3 for colour images, 1 for grey ones")
-        check_size("size", size, "44, as the paper does", least=SMALLEST_IMAGE)
+        check_size("in_channels", in_channels, "3 for colour images, 1 for grey images")
+        check_size("size", size, "44, as in the paper", least=SMALLEST_IMAGE)
         check_size("out_features", out_features, 256)
         check_widths(channels, "channels")
         if len(channels) != 4:
-            raise ValueError(f"channels must be four sizes, got {len(channels)}; the paper has (32, 64, 64, 64).")
+            raise ValueError(f"channels must be four sizes, got {len(channels)}; the paper uses (32, 64, 64, 64).")
         kernels_and_strides = ((5, 2), (3, 2), (3, 2), (3, 1))
         layers: list[nn.Module] = []
         previous, side = in_channels, size
         for width, (kernel, stride) in zip(channels, kernels_and_strides, strict=True):
             layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU(inplace=True)]
             previous, side = width, (side - kernel) // stride + 1
-        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # as oneDNN and cuDNN like it
+        self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # fast in oneDNN and cuDNN
         self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU(inplace=True))
         self.out_features = out_features
 
@@ -103,18 +103,19 @@ class ConvFeatures(Features):
         first, others = self.convolutions[0], self.convolutions[1:]
         assert isinstance(first, nn.Conv2d)
         weight = first.weight
-        if images.dtype == torch.uint8:  # exact in bfloat16, too; and there are fewer weights to scale than pixels
+        if images.dtype == torch.uint8:  # exact even in bfloat16; scaling the weights costs less
             images, weight = images.to(autocast_dtype(images) or weight.dtype), weight / 255
         features = self.dense(others(functional.conv2d(images, weight, first.bias, first.stride)))
         return features.view(*image.shape[:-3], self.out_features)
 
 
 class CellFeatures(Features):
-    """Cell codes as one-hot vectors through small dense layers: the same information as the image, cheaply.
+    """Cell codes as one-hot vectors through small dense layers: the same information as the image, at less cost.
 
-    Every cell of a window has a weight in each unit, and Adam changes all of them by the learning rate at once: the
-    larger the window, the larger the step. Windows of more than 5x5 cells are therefore scaled down, and their first
-    weights begin as much larger; a learning rate then does the same for every view.
+    Each unit has a weight for every cell of the window, and Adam changes all of them by about the learning rate at
+    once, so a larger window means a larger step. For windows of more than 5x5 cells the inputs are therefore scaled
+    down, and the initial weights of the first layer up by the same factor: a learning rate then works alike for every
+    view.
 
     Args:
         view: side of the window in cells.
@@ -147,14 +148,14 @@ class CellFeatures(Features):
 
 
 class FullyConnectedFeatures(Features):
-    """Dense layers with ReLU on a vector: what v2's meta-controller puts on the sub-controller's hidden state.
+    """Dense layers with ReLU on a vector; v2's meta-controller reads the sub-controller's hidden state through them.
 
     Args:
         in_features: size of the vector.
-        widths: sizes of the dense layers; the paper has four of 256.
+        widths: sizes of the dense layers; the paper uses four of 256.
 
     Shapes:
-        ``[*, in_features]`` numbers or flags (one-hot vectors, for instance) -> ``[*, widths[-1]]``.
+        ``[*, in_features]`` of any dtype (floats, integers, bool) -> ``[*, widths[-1]]``.
     """
 
     def __init__(self, in_features: int, widths: tuple[int, ...] = (256, 256, 256, 256)) -> None:
@@ -194,6 +195,6 @@ def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
 
 
 def _on_rows(layers: nn.Sequential, vectors: Tensor) -> Tensor:
-    """Applies layers to ``[*, I]`` as rows: autograd copies much where ReLU writes into a view."""
+    """Applies layers to ``[*, I]`` as rows, because autograd copies a lot when ReLU writes into a view."""
     rows = layers(vectors.reshape(-1, vectors.shape[-1]))
     return rows.view(*vectors.shape[:-1], rows.shape[-1])

@@ -1,14 +1,14 @@
-"""An LSTM over sequences whose state restarts inside them.
+"""An LSTM over sequences whose state can restart in the middle.
 
-``nn.LSTM`` cannot restart its state in mid-sequence, and a loop over ``LSTMCell``, which can, pays for autograd at
-every step and multiplies out each weight gradient T times. Here are two ways with the gate order and the parameters
-of ``nn.LSTM``:
+``nn.LSTM`` cannot restart its state in mid-sequence. A loop over ``LSTMCell`` can, but it pays for autograd at every
+step and computes each weight gradient T times. This module has two alternatives, both with the parameters and the gate
+order of ``nn.LSTM``:
 
-- :func:`restarting_lstm` is a loop with a backward pass of its own. One matrix product serves the inputs of all steps,
-  and one each weight gradient; only what is truly sequential is done step by step.
-- :class:`Gaps` puts an empty step before each restart, at which the state becomes zero; then the library's own
-  kernels run through whole sequences. On a CPU that is faster for long sequences, and for all under autocast. How many
-  steps it takes depends on the data, so the host has to read it: a GPU would have to wait for that.
+- :func:`restarting_lstm` is a loop with its own backward pass: one matrix product for the inputs of all steps, one for
+  each weight gradient, and only the truly sequential part step by step.
+- :class:`Gaps` inserts an empty step before each restart, which sets the state to zero; the library's own kernels then
+  process whole sequences. On a CPU this is faster for long sequences, and under autocast for all. The number of steps
+  depends on the data, so the host has to read it, which would stall a GPU.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from torch.autograd.function import once_differentiable
 from hdrqn_torchrl.devices import autocast_dtype, multiplies_bfloat16, on_host
 
 CLOSED = -1e4
-"""Input of a gate at a gap; its sigmoid is zero in every floating-point format."""
+"""Gate input at a gap; its sigmoid is zero in every floating-point format."""
 
 
 class _RestartingLSTM(torch.autograd.Function):
-    """The loop. ``inputs`` and both weights may have a lower precision: they are multiplied in it, nothing else is."""
+    """The loop. ``inputs`` and both weights may have a lower precision, which is used for matrix products only."""
 
     @staticmethod
     def forward(ctx, inputs, keep, hidden, cell, weight_ih, weight_hh, bias):  # noqa: ANN001, ANN205
@@ -61,8 +61,8 @@ class _RestartingLSTM(torch.autograd.Function):
         inputs, keep, weight_ih, weight_hh, gates, hiddens, cells, squashed = ctx.saved_tensors
         low = weight_hh.dtype
         write, forget, update, read = gates.chunk(4, -1)
-        # How the cell (first three gates) and the output (last gate) answer to each gate's input, for all steps at
-        # once; multiplied in place by their gradients below, this becomes the gradient of the gates.
+        # Derivatives of the cell (first three gates) and of the output (last gate) by the gates' inputs, for all steps
+        # at once. The loop below multiplies them in place by the gradients of cell and output: the gates' gradients.
         grad_gates = gates - gates * gates
         of_write, of_forget, of_update, of_read = grad_gates.chunk(4, -1)
         of_write *= update
@@ -90,7 +90,7 @@ class _RestartingLSTM(torch.autograd.Function):
 
 
 def lstm_weights(lstm: nn.LSTM) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Weights and biases of the first layer: input to gates, hidden to gates."""
+    """Weights (input to gates, hidden to gates) and biases of the first layer, in the order that kernels take them."""
     weight_ih, weight_hh, bias_ih, bias_hh = (
         getattr(lstm, name) for name in ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
     )
@@ -100,10 +100,10 @@ def lstm_weights(lstm: nn.LSTM) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Tensor, Tensor]) -> Tensor:
     """Outputs of a one-layer ``lstm`` (``batch_first``) whose state restarts from zero where ``init`` is set.
 
-    Under autocast matrix products have the lower precision; a CPU uses :class:`Gaps` then.
+    Under autocast, matrix products have the lower precision, and a CPU uses :class:`Gaps`.
 
     Args:
-        lstm: its parameters are used.
+        lstm: the layer whose parameters are used.
         inputs: ``[B, T, I]``.
         init: ``[B, T]`` bool; the state restarts before these steps.
         state: hidden and cell state before the first step, ``[B, H]`` each.
@@ -131,13 +131,13 @@ def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Te
 
 
 class Gaps:
-    """Empty steps before the restarts of sequences; an LSTM's state is zero behind them.
+    """Empty steps inserted before the restarts of sequences, after which an LSTM's state is zero.
 
-    A gap has an input of its own that closes the gates for writing, remembering and reading. So cell and output are
-    exactly zero there, and no gradient passes.
+    A gap sets an additional input that closes the input, forget and output gates. Cell and output are then exactly
+    zero, and no gradient passes.
 
     Args:
-        init: ``[B, T]`` bool; the state restarts before these steps. On a GPU the host waits for it.
+        init: ``[B, T]`` bool; the state restarts before these steps. The host reads it (and waits for a GPU).
 
     Examples:
         >>> inputs, init = torch.randn(2, 3, 5), torch.tensor([[True, False, True], [False, False, False]])
@@ -152,7 +152,7 @@ class Gaps:
     def __init__(self, init: Tensor) -> None:
         batch, time = init.shape
         restarts = init.cumsum(1)
-        before = restarts - restarts[:, :1]  # gaps before each step; at the first one the given state is dropped
+        before = restarts - restarts[:, :1]  # gaps before each step; a restart at the first step needs none
         self._keep = ~init[:, :1]
         self._shape, self._gapped = (batch, time), (time + int(before[:, -1].max()), batch)
         steps, rows = torch.arange(time, device=init.device), torch.arange(batch, device=init.device)
@@ -163,7 +163,7 @@ class Gaps:
         self._is_gap[self._place] = False
 
     def insert(self, steps: Tensor) -> Tensor:
-        """``[B, T, *]`` -> ``[L * B, *]``, by time. What stands at the gaps is some other step."""
+        """``[B, T, *]`` -> ``[L * B, *]``, time first. The gaps hold a copy of an arbitrary step."""
         return steps.flatten(0, 1)[self._step]
 
     def remove(self, steps: Tensor) -> Tensor:
@@ -174,15 +174,15 @@ class Gaps:
         """Outputs of a one-layer ``lstm``.
 
         Args:
-            lstm: its parameters are used.
-            parts: its inputs, side by side, ``[L * B, *]`` each.
+            lstm: the layer whose parameters are used.
+            parts: its inputs, to be concatenated, ``[L * B, *]`` each.
             state: hidden and cell state before the first step, ``[B, H]`` each.
 
         Returns:
             ``[L * B, H]``.
         """
         weight_ih, weight_hh, bias_ih, bias_hh = lstm_weights(lstm)
-        padding = -(weight_ih.shape[1] + 1) % 8  # other widths cost oneDNN half its speed in bfloat16
+        padding = -(weight_ih.shape[1] + 1) % 8  # oneDNN in bfloat16 is half as fast at other widths
         closing = weight_ih.new_zeros((4, lstm.hidden_size, 1 + padding))
         closing[:2, :, 0] = closing[3, :, 0] = CLOSED
         low = autocast_dtype(weight_ih)
@@ -195,7 +195,7 @@ class Gaps:
         settings = True, 1, 0.0, torch.is_grad_enabled(), False, False
         if low is None:
             return torch.lstm(inputs, (hidden, cell), weights, *settings)[0].flatten(0, 1)
-        # Autocast would lower the cell, too, and what a cell adds up in small steps would be lost.
+        # Autocast would also lower the precision of the cell, which would lose small increments.
         with torch.autocast(inputs.device.type, enabled=False):
             weights = [weight.to(low) for weight in weights]
             start = hidden.to(low), cell if multiplies_bfloat16(inputs.device.type) else cell.to(low)

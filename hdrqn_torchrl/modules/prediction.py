@@ -1,9 +1,9 @@
-"""What will be seen next, told from the memory: a second task that teaches a memory what is worth keeping.
+"""Predicting the next observations from the memory: an auxiliary task that teaches the memory what to keep.
 
-Q-learning tells a recurrent network little about what to remember: the value of a remembered place shows only where
-it is used. Whoever can tell what the next steps will show must know where it is and what stands around it (Guo et al.,
-2018; Gregor et al., 2019). In theory, too, a memory that predicts observations and rewards is all that optimal control
-needs (approximate information states; Subramanian et al., 2022).
+Q-learning tells a recurrent network little about what to remember, as a remembered place affects values only when it
+is used. To predict the next observations, the memory must hold where the agent is and what surrounds it (Guo et al.,
+2018; Gregor et al., 2019). There is theory for this as well: a memory that predicts observations and rewards is
+sufficient for optimal control (approximate information states; Subramanian et al., 2022).
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from hdrqn_torchrl.modules.sizes import check_size
 
 
 class Decoder(nn.Module):
-    """Turns a vector into a guess of an observation, and tells how wrong it was."""
+    """Predicts an observation from a vector, and measures the error."""
 
     def error(self, vector: Tensor, observation: Tensor) -> Tensor:
-        """Error ``[*]`` of the guess from ``vector`` ``[*, D]`` where ``observation`` ``[*, ...]`` was seen."""
+        """Error ``[*]`` of the prediction from ``vector`` ``[*, D]``, given the true ``observation`` ``[*, ...]``."""
         raise NotImplementedError
 
 
 class DecoderFactory(Protocol):
-    """Makes a decoder that reads vectors of a given size."""
+    """Makes a decoder for vectors of a given size."""
 
     def __call__(self, in_features: int) -> Decoder: ...
 
 
 class CellDecoder(Decoder):
-    """Guesses the code of every cell of a window; the error is the mean cross-entropy (nats per cell).
+    """Predicts the code of every cell of a window; the error is the mean cross-entropy (nats per cell).
 
     Args:
         in_features: D.
@@ -60,11 +60,11 @@ class CellDecoder(Decoder):
 
 
 class ImageDecoder(Decoder):
-    """Guesses an image, coarsely; the error is the mean squared error of its intensities in [0, 1].
+    """Predicts a coarse version of an image; the error is the mean squared error of intensities in [0, 1].
 
     Args:
         in_features: D.
-        channels: of the image.
+        channels: number of channels of the image.
         size: side of the coarse image in pixels.
 
     Examples:
@@ -90,14 +90,14 @@ class ImageDecoder(Decoder):
 
 
 class ObservationPredictor(nn.Module):
-    """Predicts from the memory at a step what is seen after the next k actions, 1 <= k <= ``max_steps``.
+    """Predicts the observation after the next k actions from the memory, for 1 <= k <= ``max_steps``.
 
     Args:
         make_decoder: makes the decoder for the observation.
         hidden_size: H, size of the memory's output.
         num_actions: A.
-        max_steps: K.
-        width: units of the hidden layer.
+        max_steps: largest k.
+        width: number of units in the hidden layer.
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -123,21 +123,21 @@ class ObservationPredictor(nn.Module):
         check_size("num_actions", num_actions, "the number of the environment's actions")
         self.max_steps, self.num_actions = max_steps, num_actions
         self.memory = nn.Linear(hidden_size, width)
-        self.actions = nn.Embedding(max_steps * num_actions, width)  # by place in the sequence of actions
+        self.actions = nn.Embedding(max_steps * num_actions, width)  # one for each action at each place in the sequence
         self.horizon = nn.Embedding(max_steps, width)
         self.decoder = make_decoder(width)
 
     def forward(self, memory: Tensor, action: Tensor, observation: Tensor, *, steps: int) -> Tensor:
-        """Errors of all predictions k = ``steps`` ahead along sequences.
+        """Errors of all predictions k = ``steps`` ahead, along sequences.
 
         Args:
-            memory: output of the LSTM ``[B, T, H]``, after the observation of each step.
+            memory: output of the LSTM after each step's observation, ``[B, T, H]``.
             action: ``[B, T]`` int64.
             observation: ``[B, T, ...]``.
             steps: k.
 
         Returns:
-            ``[B, T - k]``: the prediction made at step t of what step t + k showed.
+            ``[B, T - k]``: the error of the prediction made at step t of the observation at step t + k.
         """
         last = memory.shape[1] - steps
         place = torch.arange(steps, device=action.device) * self.num_actions

@@ -29,7 +29,7 @@ class DuelingHead(nn.Module):
 class ExactLinear(nn.Linear):
     """A dense layer that keeps its precision under autocast.
 
-    It makes the Q-values: in a lower precision those that differ by little would become the same.
+    It computes Q-values; in a lower precision, values that differ by little would become equal.
     """
 
     def forward(self, inputs: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ class ExactLinear(nn.Linear):
 
 
 def dueling(streams: Tensor) -> Tensor:
-    """Q-values ``[*, A]`` of a value and A advantages, ``[*, 1 + A]``."""
+    """Q-values ``[*, A]`` from a value and A advantages ``[*, 1 + A]``."""
     value, advantage = streams[..., :1], streams[..., 1:]
     return value + advantage - advantage.mean(-1, keepdim=True)
 
@@ -52,12 +52,12 @@ class QNetwork(nn.Module):
         features: maps observations to vectors of ``features.out_features``.
         num_actions: A.
         hidden_size: H, size of the recurrent layer (or of the dense layer in its place).
-        num_conditions: number of values of an integer condition (the subgoal), appended to the features as
-            a one-hot vector; 0 for none.
-        gate_features: let the condition scale each feature, too, by learned factors. Appended alone it is a faint
+        num_conditions: number of values of an integer condition (the subgoal), which is appended to the features as
+            a one-hot vector; 0 for no condition.
+        gate_features: whether the condition also scales each feature by a learned factor. Only appended, it is a weak
             signal: "go to goal k" needs the product of what is seen and which goal is wanted.
         recurrent: ``False`` replaces the LSTM by a dense layer with ReLU.
-        predictor: a second task for the memory; not used in acting.
+        predictor: predicts observations from the memory, as an auxiliary task; not used for acting.
 
     Raises:
         ValueError: if a size breaks its rule, or there is a predictor without a memory.
@@ -86,8 +86,8 @@ class QNetwork(nn.Module):
     ) -> None:
         super().__init__()
         if predictor is not None and not recurrent:
-            raise ValueError("predictor must be None with recurrent=False: there is no memory to teach.")
-        check_size("hidden_size", hidden_size, "256, as the paper does")
+            raise ValueError("predictor must be None with recurrent=False: there is no memory to train.")
+        check_size("hidden_size", hidden_size, "256, as in the paper")
         check_size("num_actions", num_actions, "the number of the environment's actions, or of its subgoals")
         check_size("num_conditions", num_conditions, "the number of subgoals, or 0 for none", least=0)
         self.features, self.hidden_size, self.recurrent = features, hidden_size, recurrent
@@ -124,7 +124,7 @@ class QNetwork(nn.Module):
         return torch.lstm_cell(features, state, *lstm_weights(memory))
 
     def step(self, observation: Tensor, condition: Tensor | None, state: State) -> tuple[Tensor, State]:
-        """One decision: Q-values ``[*, A]`` and the state after ``observation`` ``[*, ...]``, ``condition`` ``[*]``."""
+        """Q-values ``[*, A]`` and the new state, from ``observation`` ``[*, ...]`` and ``condition`` ``[*]``."""
         features = self._embed(observation, condition)
         if features.ndim == 1:
             hidden, cell = self._cell(features[None], (state[0][None], state[1][None]))
@@ -164,11 +164,11 @@ class QNetwork(nn.Module):
         init: Tensor | None = None,
         state: State | None = None,
     ) -> Tensor:
-        """What the Q-values of :meth:`unroll` are read from: the recurrent layer's output, ``[B, T, H]``."""
+        """The recurrent layer's output ``[B, T, H]``, from which :meth:`unroll` computes the Q-values."""
         features = self._embed(observation, condition)
         if not isinstance(self.memory, nn.LSTM):
             return self.memory(features)
-        lower = autocast_dtype(features) is not None  # the library's own call would lower the cell, too
+        lower = autocast_dtype(features) is not None  # nn.LSTM would also lower the precision of the cell
         if lower or (init is not None and not (on_host(init) and not init[:, 1:].any())):
             init = features.new_zeros(features.shape[:2], dtype=torch.bool) if init is None else init
             state = self.initial_state(len(features)) if state is None else state
@@ -183,7 +183,7 @@ class QNetwork(nn.Module):
         """State at the end of sequences of different lengths that start from the zero state.
 
         Args:
-            observation: ``[B, T, ...]``; what lies behind a sequence's end is not read.
+            observation: ``[B, T, ...]``; steps after a sequence's end are not read.
             condition: ``[B, T]`` int64, or ``None``.
             lengths: ``[B]`` int64, between 1 and T.
 

@@ -1,4 +1,4 @@
-"""The rule that sizes of networks follow."""
+"""Checks of the sizes that networks are built from."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from numbers import Integral
 
 
 def check_size(name: str, size: int, usual: int | str, *, least: int = 1) -> None:
-    """Refuses a size that is too small, or not a whole number.
+    """Refuses a size that is too small or not a whole number.
 
     Args:
-        name: of the argument.
+        name: name of the argument, for the message.
         size: its value.
-        usual: one that works, for the message.
-        least: the smallest.
+        usual: a value that works, for the message.
+        least: the smallest valid size.
 
     Raises:
-        ValueError: with name, rule, value and a way out.
+        ValueError: if the size is not valid.
 
     Examples:
         >>> check_size("hidden_size", 0, 64)
@@ -31,10 +31,10 @@ def check_size(name: str, size: int, usual: int | str, *, least: int = 1) -> Non
 
 
 def check_widths(widths: Sequence[int], name: str = "widths") -> tuple[int, ...]:
-    """Sizes of several layers, at least one.
+    """Checks the sizes of several layers, and returns them as a tuple.
 
     Raises:
-        ValueError: if there is none, or one that :func:`check_size` refuses.
+        ValueError: if the list is empty, or :func:`check_size` refuses one of them.
     """
     sizes = tuple(widths) if isinstance(widths, Sequence) and not isinstance(widths, str) else ()
     if not sizes:

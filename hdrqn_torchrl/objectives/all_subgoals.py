@@ -1,29 +1,29 @@
 r"""hDRQNv3's loss: every subgoal and every level learn from every step.
 
 Level l chooses among :math:`X_l` (actions at level 0, else subgoals) and pursues some c of :math:`C_l = X_{l+1}`; the
-top level pursues the task. For every level, every c and every x that would have led to what was done in step t:
+top level pursues the task. For every level, every c and every choice x that agrees with step t, the target is
 
 .. math:: y_l(c, x) = r_l(c) + \gamma_l (1 - e_l(c)) ((1 - \lambda_t) U_l(c, x) + \lambda_t y_l(c, x)_{t+1})
 
-- reward :math:`r_l(c)`: the task's extrinsic reward at the top; below, what the critic pays for c
+- reward :math:`r_l(c)`: at the top the task's extrinsic reward; below, the critic's reward for c
   (:class:`~hdrqn_torchrl.transforms.SubgoalTransform`, rule 3);
-- end :math:`e_l(c)`: the episode terminated, or c was attained (below the top);
-- :math:`U = \max_{x'} Q_l(s', c, x')` (Double, among what can be chosen) where x was attained in this step, as an
-  action is by every step; else :math:`Q_l(s', c, x)`: the option goes on;
-- :math:`\lambda_t` is lambda where the next step agrees with x, else 0 (Watkins' cut); a subgoal's trace ends where it
+- end :math:`e_l(c)`: the episode terminated or, below the top, c was attained;
+- :math:`U = \max_{x'} Q_l(s', c, x')` (Double, over what can be chosen) if x was attained in this step, which always
+  holds for an action; else :math:`Q_l(s', c, x)`, as the option goes on;
+- :math:`\lambda_t` is lambda if the next step agrees with x, else 0 (Watkins' cut); a subgoal's trace ends where it
   is attained;
-- a subgoal x agrees with a step if the greedy choice of the level below for x does, recursively, down to the action
-  taken. x learns from steps it agrees with (intra-option learning; Sutton, Precup and Singh, 1998), and from those at
+- an action agrees with a step if it was taken; a subgoal x agrees if the greedy choice of the level below for x does.
+  x learns from the steps that it agrees with (intra-option learning; Sutton, Precup and Singh, 1998), and from those in
   which it was pursued.
 
-So every level learns from every step, and not only from those at which its options begin. Without intra-option
-learning a level above the first learns where options begin only, from what the option brought (SMDP),
+So every level learns from every step, not only from those at which its options begin. Without intra-option learning,
+levels above the first learn only from the first step of each option, with the rewards of the whole option (SMDP):
 
 .. math:: y = r_0 + \gamma r_1 + \dots + \gamma^k ((1 - \lambda') \max_{x'} Q(s_k, x') + \lambda' y_k)
 
-with :math:`\lambda'` = lambda where the next subgoal is the greedy one, else 0.
+with :math:`\lambda'` = lambda if the next subgoal is the greedy one, else 0.
 
-Memory: if the network has a predictor, it is also trained to tell what the next few steps will show.
+If the network has a predictor, the memory is also trained to predict the observations of the next few steps.
 """
 
 from __future__ import annotations
@@ -51,40 +51,40 @@ Values = tuple[Tensor, ...]
 class AllSubgoalsLoss(SequenceLoss):
     """Trains an :class:`~hdrqn_torchrl.modules.AllSubgoalsPolicy` on sequences ``[B, T + lookahead]`` of steps.
 
-    The last step only values what the one before led to, so that no observation is stored twice. Sequences may run
-    on through ends of episodes; each should begin where an episode does, because the memory starts empty, unless it
-    starts from what was stored (``stored_state``). Steps after a sequence's end are padding (``mask``): they contribute
-    nothing, and what the last real step led to is unknown unless it ended the episode. ``priority`` tells what is left
-    to learn from each sequence, of all levels together, ``[B]``.
+    The last step only serves to evaluate the outcome of the step before, so that no observation is stored twice.
+    Sequences may continue past the end of an episode. Each should start at the start of an episode, because the memory
+    starts empty, unless ``stored_state`` is set. Steps after the end of a sequence are padding (``mask``) and
+    contribute nothing; the outcome of the last real step is unknown unless it ended the episode. ``priority`` ``[B]``
+    measures how much is left to learn from each sequence, over all levels.
 
     Args:
         policy: network and keys.
-        sub_gamma: discount of level 0. A low one makes haste pay: of two ways, the shorter stands out.
+        sub_gamma: discount of level 0. A low discount makes the shorter of two ways stand out.
         meta_gamma: discount of the top level, per environment step.
-        middle_gamma: of the levels between; ``None``: ``meta_gamma``.
+        middle_gamma: discount of the levels in between; ``None``: ``meta_gamma``.
         trace_decay: lambda.
-        reached_reward, hazard_reward: of the levels below the top, for attaining the subgoal, and for meeting the
-            hazard (which is not read if that is 0).
-        wrong_subgoal_reward: for attaining another subgoal of the same set; one number for the
-            farthest set, or one for each set from near to far.
-        bonus_reward: for an agent of one level, which has no critic: added to the task's reward for each subgoal that a
-            step attains (key ``bonus``).
+        reached_reward: reward of the levels below the top for attaining their subgoal.
+        hazard_reward: reward of the same levels for meeting the hazard; 0: the hazard is not read.
+        wrong_subgoal_reward: reward of the same levels for attaining another subgoal of the same set; one number for
+            the farthest set, or one for each set from near to far.
+        bonus_reward: for agents of one level, which have no critic: added to the task's reward for each subgoal
+            attained in a step (key ``bonus``).
         double: Double Q-learning.
-        all_subgoals: ``False``: each level learns only about what was pursued.
-        intra_option: ``False``: levels that choose subgoals learn from the steps at which options begin only, and of
-            those whose end is in the sequence. (``True`` takes options to last until their subgoal is attained: a step
-            limit of options is not seen.)
-        max_meta_target, min_meta_target: largest and smallest return of the task there can be, if known; the top
-            level's targets are kept between them.
+        all_subgoals: ``False``: each level learns only about the subgoal that was pursued.
+        intra_option: ``False``: levels that choose subgoals learn only from the first steps of options, and only of
+            options that end within the sequence. (With ``True``, options are assumed to last until their subgoal is
+            attained; a step limit of options is ignored.)
+        max_meta_target, min_meta_target: largest and smallest possible return of the task, if known; the top level's
+            targets are clipped to this range.
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
-            in sequences that begin where an episode does, every state is exact.
-        lookahead: steps at the end of each sequence that are not trained: the last one, and before it those that are
-            there for the targets of others (:func:`~hdrqn_torchrl.objectives.target_lookahead`).
+            in sequences that start with an episode, every state is exact.
+        lookahead: number of steps at the end of each sequence that are not trained: the last one, and before it those
+            that only serve the targets of earlier steps (:func:`~hdrqn_torchrl.objectives.target_lookahead`).
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
-        stored_state: sequences start from the LSTM state that acting had at their first step, in both networks, and
-            from zero where an episode starts.
-        prediction_weight: of the error of the network's predictor, if it has one; how many steps ahead it looks is
-            drawn anew for every minibatch.
+        stored_state: whether sequences start, in both networks, from the LSTM state that acting had at their first
+            step; from zero at the start of an episode.
+        prediction_weight: weight of the error of the network's predictor, if it has one. The number of steps that it
+            looks ahead is drawn anew for every minibatch.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -141,7 +141,7 @@ class AllSubgoalsLoss(SequenceLoss):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
         if lookahead < 1:
-            raise ValueError(f"lookahead must be >= 1 step, got {lookahead}; the last one is never trained.")
+            raise ValueError(f"lookahead must be >= 1 step, got {lookahead}; the last step is never trained.")
         super().__init__(
             policy,
             "policy",
@@ -215,7 +215,7 @@ class AllSubgoalsLoss(SequenceLoss):
     def _report(
         self, losses: list[Tensor], values: list[Tensor], wanted: list[Tensor], trained: list[Tensor]
     ) -> dict[str, Tensor]:
-        """Figures of each level; those of level 0 have plain names."""
+        """Figures of each level; those of level 0 have no prefix."""
         report = {"target": masked_mean(wanted[0], trained[0]), "trained_steps": trained[0].sum()}
         errors = [value - target for value, target in zip(values, wanted, strict=True)]
         for index, rule in enumerate(self.rules):
@@ -227,7 +227,7 @@ class AllSubgoalsLoss(SequenceLoss):
         return report
 
     def _values(self, tensordict: TensorDictBase) -> tuple[Values, Values, Tensor]:
-        """Q-values of all levels ``[B, T + 1, C, X]`` by main and target network; the main network's memory
+        """Q-values of all levels ``[B, T + 1, C, X]`` by main and target network; the main network's LSTM output
         ``[B, T + 1, H]``."""
         policy = self._networks[0]
         read = (policy.observation_key, policy.previous_action_key, policy.init_key, *policy.mask_keys)
@@ -244,7 +244,7 @@ class AllSubgoalsLoss(SequenceLoss):
             return online, target, memory
 
     def _events(self, tensordict: TensorDictBase, valid: Tensor) -> StepEvents:
-        """What each step ``[B, T]`` led to, apart from subgoals."""
+        """The outcome of each step ``[B, T]``, except for subgoals."""
         k, after = self.tensor_keys, tensordict[:, :-1]["next"]
         done, terminated = after[k.done].squeeze(-1), after[k.terminated].squeeze(-1)
         last = valid[:, :-1] & ~valid[:, 1:]  # before padding
@@ -259,7 +259,7 @@ class AllSubgoalsLoss(SequenceLoss):
         )
 
     def _wanted(self, columns: list[Columns]) -> list[Tensor]:
-        """The targets of each level ``[B, T, C * X]``: one recursion serves all, as columns beside each other."""
+        """The targets of each level ``[B, T, C * X]``, by one recursion over the concatenated columns of all levels."""
         returns = lambda_returns(
             torch.cat([each.reward for each in columns], -1),
             torch.cat([each.ended for each in columns], -1),
@@ -274,6 +274,6 @@ class AllSubgoalsLoss(SequenceLoss):
 
 
 def _chosen(online: Values, action: Tensor) -> list[Tensor]:
-    """The values that are trained, ``[B, T, C]`` of the actions taken and ``[B, T, C * X]`` of all subgoals."""
+    """The values that are trained: ``[B, T, C]`` of the actions taken, ``[B, T, C * X]`` of all subgoals."""
     taken = action[:, :-1, None, None].expand(*online[0][:, :-1].shape[:-1], 1)
     return [online[0][:, :-1].gather(-1, taken).squeeze(-1), *(value[:, :-1].flatten(-2) for value in online[1:])]

@@ -1,7 +1,7 @@
 """What one level of hDRQNv3 learns from each step of a sequence: the rule of :mod:`.all_subgoals`, level by level.
 
-``B`` sequences, ``T`` steps and one more that only values what came before; ``C`` subgoals that the level can be told
-to reach, ``X`` choices that it has. At level 0, of all actions only the one taken has a column.
+Shapes: ``B`` sequences of ``T`` steps and one more, which only serves to evaluate the step before; ``C`` subgoals that
+the level can be given, ``X`` choices that it has. At level 0 only the action taken has a column.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from hdrqn_torchrl.transforms import IntrinsicReward, penalties_of_sets
 
 @dataclass(frozen=True, kw_only=True)
 class LevelRule:
-    """What a level chooses among, what it pursues, and what that pays.
+    """What a level chooses among, what it pursues, and how it is rewarded.
 
     Args:
-        name: of its figures in the loss's report.
+        name: name of the level's figures in the report of the loss.
         gamma: discount of one environment step.
         choices: entries of the subgoals that it chooses among; ``None``: actions.
-        pursues: entries of the subgoals that it is told to reach; ``None``: the task.
-        rewards: what reaching them pays; ``None`` at the top.
+        pursues: entries of the subgoals that it is given; ``None``: the task.
+        rewards: the critic's rewards for reaching them; ``None`` at the top.
         largest_return, smallest_return: bounds of its targets.
     """
 
@@ -43,12 +43,12 @@ class LevelRule:
 
 @dataclass(frozen=True, kw_only=True)
 class StepEvents:
-    """What each step ``[B, T]`` led to, apart from subgoals.
+    """The outcome of each step ``[B, T]``, except for subgoals.
 
     Args:
-        terminated: the episode ended there, bool.
-        unseen: what follows is not in the sequence: cut off by a time limit, or by the sequence's end; bool.
-        reward: the task's, ``[B, T, 1]``.
+        terminated: bool; the episode terminated.
+        unseen: bool; what follows is not in the sequence, because of a time limit or the end of the sequence.
+        reward: reward of the task, ``[B, T, 1]``.
         hazard: ``[B, T, 1]`` bool; ``None``: not read.
     """
 
@@ -68,15 +68,15 @@ class Columns:
     trace: Tensor
     discount: Tensor
     trained: Tensor
-    """bool: entries that learn."""
+    """bool: entries that enter the loss."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelTargets:
-    """Turns the values of all levels into the parts of their targets.
+    """Computes the parts of the targets of all levels from their Q-values.
 
     Args:
-        rules: of each level, from level 0 up.
+        rules: one for each level, from level 0 up.
         trace_decay: lambda.
         double: Double Q-learning.
         all_subgoals, intra_option: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
@@ -100,14 +100,14 @@ class LevelTargets:
 
         Args:
             online, target: Q-values of each level by main and target network, ``[B, T + 1, C, X]``.
-            action: what was done, ``[B, T + 1]`` int64.
+            action: the actions taken, ``[B, T + 1]`` int64.
             tensordict: the sequences ``[B, T + 1]``.
-            events: what their steps led to.
+            events: the outcomes of their steps.
         """
-        agrees = online[0].argmax(-1) == action.unsqueeze(-1)  # [B, T + 1, C]: the greedy action for c is the one taken
+        agrees = online[0].argmax(-1) == action.unsqueeze(-1)  # [B, T + 1, C]: the greedy action for c was taken
         found = [self._of_actions(self.rules[0], online[0], target[0], agrees, tensordict, events)]
         for index, rule in enumerate(self.rules[1:], 1):
-            if index > 1:  # the greedy choice for c of the level below agrees
+            if index > 1:  # whether the greedy choice for c of the level below agrees
                 chosen = greedy_choice(online[index - 1], _mask(self.rules[index - 1], tensordict))
                 agrees = agrees.gather(-1, chosen)
             found.append(self._of_subgoals(rule, online[index], target[index], agrees, tensordict, events))
@@ -122,7 +122,7 @@ class LevelTargets:
         tensordict: TensorDictBase,
         events: StepEvents,
     ) -> Columns:
-        """Level 0: every step attains its action, so that each is followed by the best one."""
+        """Level 0: every step completes its action, so the best action follows."""
         best = double_q_value(online if self.double else target, target)[:, 1:]
         trace = watkins_trace(agrees, self.trace_decay)[:, :-1]
         trained = torch.ones_like(best, dtype=torch.bool)
@@ -137,7 +137,7 @@ class LevelTargets:
         tensordict: TensorDictBase,
         events: StepEvents,
     ) -> Columns:
-        """A level above the first: where x is not attained, its option goes on; ``agrees`` is ``[B, T + 1, X]``."""
+        """Levels above the first: unless x was attained, its option goes on; ``agrees`` is ``[B, T + 1, X]``."""
         assert rule.choices is not None
         steps, names = tensordict[:, :-1], rule.choices
         best = double_q_value(online if self.double else target, target, _mask(rule, tensordict))[:, 1:].unsqueeze(-1)
@@ -170,7 +170,7 @@ class LevelTargets:
         tensordict: TensorDictBase,
         events: StepEvents,
     ) -> Columns:
-        """Adds what depends on the pursued subgoal alone: reward, end, and which of them learn; ``[B, T, C, X]``."""
+        """Adds what depends only on the pursued subgoal: reward, end, and which subgoals learn; ``[B, T, C, X]``."""
         steps = tensordict[:, :-1]
         reward, ended = events.reward, events.terminated.unsqueeze(-1)
         if rule.pursues is not None and rule.rewards is not None:
@@ -183,7 +183,7 @@ class LevelTargets:
                 trained = trained & pursued.unsqueeze(-1)
         unseen = events.unseen.unsqueeze(-1) & ~ended
         trace = trace.masked_fill(events.unseen[..., None, None], 0.0)
-        trace[:, :-1].masked_fill_(unseen[:, 1:].unsqueeze(-1), 0.0)  # there is no target to take over
+        trace[:, :-1].masked_fill_(unseen[:, 1:].unsqueeze(-1), 0.0)  # the next step has no target
         shape = following.shape
 
         def spread(value: Tensor) -> Tensor:
@@ -199,8 +199,8 @@ class LevelTargets:
         )
 
     def _option_trace(self, rule: LevelRule, online: Tensor, whole: Tensor, tensordict: TensorDictBase) -> Tensor:
-        """Traces ``[B, T, C]`` along options: all inside them; lambda to the next one, if it is the greedy choice and
-        seen to its end."""
+        """Traces ``[B, T, C]`` along options: 1 inside an option; lambda across to the next option if that is the
+        greedy choice and ends within the sequence, else 0."""
         assert rule.choices is not None
         names = rule.choices
         active = tensordict["next", names.active_subgoal].unsqueeze(-1)
@@ -225,14 +225,14 @@ def make_rules(
     """The rules of all levels of an agent, from level 0 up.
 
     Args:
-        subgoals: entries of each set of subgoals, from near to far; none: one level.
-        sub_gamma, middle_gamma, meta_gamma: discounts of level 0, of those between, and of the top level above it.
-        reached_reward, hazard_reward: of the critic.
-        wrong_subgoal_reward: of the critic (:func:`~hdrqn_torchrl.transforms.penalties_of_sets`).
-        largest_return, smallest_return: of the task.
+        subgoals: entries of each set of subgoals, from near to far; empty: an agent of one level.
+        sub_gamma, middle_gamma, meta_gamma: discounts of level 0, of the levels in between, and of the top level.
+        reached_reward, hazard_reward: the critic's rewards.
+        wrong_subgoal_reward: the critic's penalties (:func:`~hdrqn_torchrl.transforms.penalties_of_sets`).
+        largest_return, smallest_return: bounds of the task's return.
 
     Raises:
-        ValueError: if there are not as many penalties as sets.
+        ValueError: if the number of penalties does not fit the number of sets.
     """
     penalties = penalties_of_sets(wrong_subgoal_reward, len(subgoals))
     rules = []
@@ -264,7 +264,7 @@ def _mask(rule: LevelRule, tensordict: TensorDictBase) -> Tensor:
 
 
 def _ends_in_sequence(names: OptionKeys, tensordict: TensorDictBase, events: StepEvents) -> Tensor:
-    """Steps ``[B, T]`` whose option ends within the sequence, what it led to included."""
+    """Steps ``[B, T]`` whose option ends within the sequence, with a known outcome."""
     seen = ~events.unseen
     ends = (tensordict[names.option_init].squeeze(-1)[:, 1:] | events.terminated) & seen
     found = [torch.zeros_like(ends[:, 0])]

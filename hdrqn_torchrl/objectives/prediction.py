@@ -17,20 +17,20 @@ def prediction_loss(
     valid: Tensor,
     cut: Tensor,
 ) -> Tensor:
-    """Mean error of what the predictor expects some steps ahead, how many is drawn anew at each call.
+    """Mean error of the predictor some steps ahead; the number of steps is drawn anew at each call.
 
     Args:
         predictor: the predictor.
         memory: output of the LSTM ``[B, T + 1, H]``.
         action: ``[B, T]`` int64, or one more.
         observation: ``[B, T + 1, ...]``.
-        valid: what is no padding, ``[B, T + 1]`` bool; padding only follows valid steps.
-        cut: where the next observation is not what the step led to, ``[B, T]`` bool.
+        valid: ``[B, T + 1]`` bool, ``False`` for padding, which only follows valid steps.
+        cut: ``[B, T]`` bool; the next observation does not result from the step (another episode begins).
 
     Returns:
-        Scalar; 0 if nothing could be predicted.
+        Scalar; 0 if there was nothing to predict.
     """
-    ahead = int(torch.randint(1, min(predictor.max_steps, cut.shape[1]) + 1, ()))  # by the host, from its generator
+    ahead = int(torch.randint(1, min(predictor.max_steps, cut.shape[1]) + 1, ()))  # on the host, which must know it
     error = predictor(memory, action, observation, steps=ahead)
     known = valid[:, ahead:] & ~cut.unfold(1, ahead, 1).any(-1)
     return error.masked_fill(~known, 0.0).sum() / known.sum().clamp(min=1)

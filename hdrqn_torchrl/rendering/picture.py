@@ -10,14 +10,14 @@ from hdrqn_torchrl.rendering.episodes import Frame
 from hdrqn_torchrl.rendering.levels import BarSpans, Level, caption, levels_of
 from hdrqn_torchrl.rendering.style import font
 
-WIDTH, HEIGHT = 760, 456  # even, as video codecs want it
+WIDTH, HEIGHT = 760, 456  # even numbers, which video codecs need
 _MARGIN, _TOP, _WORLD, _VIEW = 12, 40, 374, 130
 _LEFT = _MARGIN + _WORLD + 20  # of the right-hand column
 _RIGHT, _BOTTOM = WIDTH - _MARGIN, _TOP + _WORLD
 _TITLE = 25  # height of a title
 
 _PAPER, _INK, _FAINT = (255, 255, 255), (32, 32, 32), (120, 120, 120)
-_PALE, _MASKED, _TRACK = (200, 200, 200), (175, 175, 175), (242, 242, 242)  # other bars, what is masked, empty bars
+_PALE, _MASKED, _TRACK = (200, 200, 200), (175, 175, 175), (242, 242, 242)  # bars not chosen, masked names, empty bars
 _GOOD, _BAD = (44, 160, 44), (112, 112, 112)
 
 
@@ -45,7 +45,7 @@ def draw_frame(frame: Frame, spans: BarSpans = BarSpans()) -> NDArray[np.uint8]:
 
 
 def _paste(image: Image.Image, picture: Image.Image, left: int, top: int, size: int) -> None:
-    """Puts a picture into a square, at its left edge and in the middle of its height."""
+    """Puts a picture into a square, on the left and vertically centred."""
     image.paste(picture, (left, top + (size - picture.height) // 2))
 
 
@@ -87,7 +87,7 @@ def _draw_levels(draw: ImageDraw.ImageDraw, levels: list[Level]) -> None:
 
 
 def _draw_title(draw: ImageDraw.ImageDraw, level: Level, top: int) -> None:
-    """The choice on its colour, and how long it has held."""
+    """The choice on its colour, and how long it has lasted."""
     middle, choice = top + 9, level.decision.choice
     draw.text((_LEFT, middle), level.verb, _INK, font(16, bold=True), anchor="lm")
     start = _LEFT + draw.textlength(level.verb, font(16, bold=True)) + 10
@@ -101,7 +101,7 @@ def _draw_title(draw: ImageDraw.ImageDraw, level: Level, top: int) -> None:
 
 
 def _draw_bars(draw: ImageDraw.ImageDraw, level: Level, start: int, top: int, row: int, size: int) -> None:
-    """Name, bar and value of each choice; ``row`` is the height of one, ``size`` that of its letters."""
+    """Name, bar and value of each choice; ``row`` is the height of a row, ``size`` that of the font."""
     end = round(_RIGHT - draw.textlength("-0.000", font(size, bold=True)) - 8)
     for index, name in enumerate(level.names):
         chosen = index == level.decision.choice
@@ -119,7 +119,7 @@ def _draw_bars(draw: ImageDraw.ImageDraw, level: Level, start: int, top: int, ro
 
 
 def _draw_caption(draw: ImageDraw.ImageDraw, frame: Frame, levels: list[Level]) -> None:
-    """What happened, if anything did; the scale of the bars otherwise."""
+    """What happened in the step; if nothing did, the scale of the bars."""
     middle, text = (_BOTTOM + HEIGHT) // 2, caption(frame)
     if not frame.outcome:
         scales = ", ".join(f"{level.span:g} ({level.symbol})" for level in levels if not level.brief)

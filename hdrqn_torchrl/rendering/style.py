@@ -1,4 +1,4 @@
-"""Colours and letters of pictures."""
+"""Colours and fonts of pictures."""
 
 from hdrqn_torchrl.envs.scene import Colour, font
 

@@ -1,4 +1,4 @@
-"""Recorded episodes as text, live in a terminal."""
+"""Plays recorded episodes as text in a terminal."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def draw_text(frame: Frame, spans: BarSpans = BarSpans()) -> RenderableType:  # 
 
 
 def play_in_terminal(frames: Sequence[Frame], console: Console | None = None, *, fps: int = 4) -> None:
-    """Shows frames in place, at their pace; where the output is no terminal, prints them one after the other at once.
+    """Shows frames in place, at ``fps``; if the output is not a terminal, prints all of them at once.
 
     Args:
         frames: what :func:`~hdrqn_torchrl.rendering.record_episodes` returned.
-        console: where to; ``None`` is the standard output.
+        console: where to show them; ``None``: the standard output.
         fps: steps per second.
 
     Raises:
@@ -74,7 +74,7 @@ def _header(frame: Frame) -> Text:
 
 
 def _bars(level: Level) -> Table:
-    """Name, bar and value of each choice; an arrow marks the chosen one, what is masked is dim."""
+    """Name, bar and value of each choice; an arrow marks the chosen one, and masked ones are dim."""
     table = Table.grid(padding=(0, 1))
     for index, name in enumerate(level.names):
         chosen, allowed = index == level.decision.choice, level.decision.allowed[index]

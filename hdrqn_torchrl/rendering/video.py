@@ -1,4 +1,4 @@
-"""Recorded episodes as files: GIF and MP4."""
+"""Writes recorded episodes to GIF and MP4 files."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from hdrqn_torchrl.rendering.episodes import Frame
 from hdrqn_torchrl.rendering.levels import bar_spans
 from hdrqn_torchrl.rendering.picture import HEIGHT, WIDTH, draw_frame
 
-_COLOURS = 64  # of a GIF's palette
-_SAMPLES = 24  # pictures from which the palette is made
+_COLOURS = 64  # size of a GIF's palette
+_SAMPLES = 24  # number of pictures from which the palette is made
 
 
 def hold(frame: Frame, fps: int) -> int:
-    """How many ticks of a video a frame lasts: two where an option starts, two seconds at the end of an episode."""
+    """Ticks that a frame lasts: two if an option starts, two seconds at the end of an episode, else one."""
     if frame.outcome:
         return 2 * fps
     return 2 if frame.starts_option else 1
 
 
 def check_video(path: Path | None, *, fps: int) -> None:
-    """Refuses, before anything is played, what :func:`write_video` or a terminal can't show.
+    """Refuses, before any episode is played, what :func:`write_video` or a terminal can't show.
 
     Args:
         path: file to write; ``None`` for a terminal.
         fps: steps per second.
 
     Raises:
-        ValueError: if the file has another ending than .gif or .mp4, PyAV is missing, or ``fps`` is out of range.
+        ValueError: if the file does not end in .gif or .mp4, PyAV is missing, or ``fps`` is out of range.
     """
     if path is not None and path.suffix.lower() not in _WRITERS:
         raise ValueError(f"out must end in {' or '.join(_WRITERS)}, or be terminal, got {str(path)!r}.")
     if path is not None and path.suffix.lower() == ".mp4" and find_spec("av") is None:
         raise ValueError("out=*.mp4 needs PyAV: pip install 'hdrqn_torchrl[video]', or write a .gif.")
     if not 1 <= fps <= 50:
-        raise ValueError(f"fps must lie in [1, 50], got {fps}; 4 steps a second can be followed.")
+        raise ValueError(f"fps must lie in [1, 50], got {fps}; use 4 to follow each step.")
 
 
 def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4) -> None:
-    """Writes a GIF that repeats for ever, or an MP4 (H.264), which needs PyAV.
+    """Writes a GIF that loops forever, or an MP4 (H.264), which needs PyAV.
 
     Args:
         frames: what :func:`~hdrqn_torchrl.rendering.record_episodes` returned, at least one.
@@ -56,7 +56,7 @@ def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4) -> None:
     """
     check_video(path, fps=fps)
     if not frames:
-        raise ValueError("frames must hold at least one frame, got none; record_episodes makes them.")
+        raise ValueError("frames must hold at least one frame, got none; use record_episodes.")
     _WRITERS[path.suffix.lower()](frames, path, fps)
 
 
@@ -70,7 +70,7 @@ def _write_gif(frames: Sequence[Frame], path: Path, fps: int) -> None:
         append_images=images,
         duration=[round(1000 * hold(frame, fps) / fps) for frame in frames],
         loop=0,
-        optimize=True,  # leaves out what has not changed
+        optimize=True,  # leaves out pixels that have not changed
     )
 
 
@@ -90,22 +90,23 @@ _WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
 
 
 def _pictures(frames: Sequence[Frame]) -> Iterator[Image.Image]:
-    """One after the other: many pictures would fill the memory."""
+    """Draws the pictures one at a time, as all of them would fill the memory."""
     spans = bar_spans(frames)
     return (Image.fromarray(draw_frame(frame, spans)) for frame in frames)
 
 
 def _palette(frames: Sequence[Frame]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """The commonest colours of a recording ``[C, 3]``; for every coarse colour the index of the nearest ``[2**15]``.
+    """The most common colours ``[C, 3]``, and for every coarse colour the index of the nearest of them ``[2**15]``.
 
-    One palette for all pictures keeps still parts equal, and the file small. Pillow's own way shifts plain colours.
+    With one palette for all pictures, still parts stay equal and the file small. Pillow's own palettes shift plain
+    colours.
     """
     sample = [*frames[:: -(-len(frames) // _SAMPLES)], *[frame for frame in frames if frame.outcome][:_SAMPLES]]
     pixels = np.concatenate([np.asarray(picture).reshape(-1, 3) for picture in _pictures(sample)])
     colours, counts = np.unique(pixels.astype(np.int64) @ (1 << 16, 1 << 8, 1), return_counts=True)
     colours = colours[np.argsort(-counts, kind="stable")]
     colours = np.stack([colours >> 16, colours >> 8 & 255, colours & 255], -1)
-    _, first = np.unique(_coarse(colours), return_index=True)  # the commonest of each coarse colour
+    _, first = np.unique(_coarse(colours), return_index=True)  # the most common of each coarse colour
     colours = colours[np.sort(first)[:_COLOURS]]
     axis = np.arange(4, 256, 8)
     every = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 1, 3)
@@ -115,7 +116,7 @@ def _palette(frames: Sequence[Frame]) -> tuple[NDArray[np.uint8], NDArray[np.uin
 
 
 def _coarse(colours: NDArray) -> NDArray:
-    """Five bits of each channel, ``[*, 3]`` -> ``[*]``."""
+    """The upper five bits of each channel as one number, ``[*, 3]`` -> ``[*]``."""
     return (colours >> 3).astype(np.int64) @ (1 << 10, 1 << 5, 1)
 
 

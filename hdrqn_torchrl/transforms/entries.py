@@ -1,4 +1,4 @@
-"""Whether an environment has the entries that something reads: all that is wrong, in one message."""
+"""Checks that an environment has the entries that its readers need, and reports all problems in one message."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torchrl.envs import EnvBase
 
 
 class Entries:
-    """The entries of an environment, by key, and what was found wrong with them.
+    """The entries of an environment by key, and the problems found with them.
 
     Args:
-        batch_size: of the environment.
-        parts: specs of its observations, rewards and ends of episodes.
+        batch_size: batch size of the environment.
+        parts: specs of its observations, actions, rewards and done flags; ``None`` is skipped.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -34,20 +34,20 @@ class Entries:
 
     @classmethod
     def of(cls, env: EnvBase) -> Entries:
-        """Those of an environment, actions included."""
+        """The entries of an environment, including its actions."""
         return cls(env.batch_size, env.observation_spec, env.full_action_spec, env.full_reward_spec, env.full_done_spec)
 
     def __contains__(self, key: NestedKey) -> bool:
         return key in self.specs
 
     def require_flags(self, key: NestedKey, size: int | None = 1) -> None:
-        """Bool entries ``[*batch, size]``; ``None``: of any size from 1 on."""
-        remedy = "cast it, with DTypeCastTransform(dtype_in=..., dtype_out=torch.bool, in_keys=[...]) for instance"
+        """Requires a bool entry ``[*batch, size]``; ``None``: any size from 1 on."""
+        remedy = "cast it, for instance with DTypeCastTransform(dtype_in=..., dtype_out=torch.bool, in_keys=[...])"
         self._require(key, torch.bool, size, remedy)
 
     def require_number(self, key: NestedKey) -> None:
-        """An entry ``[*batch, 1]`` of float32."""
-        self._require(key, torch.float32, 1, "cast it, with DoubleToFloat(in_keys=[...]) for instance")
+        """Requires a float32 entry ``[*batch, 1]``."""
+        self._require(key, torch.float32, 1, "cast it, for instance with DoubleToFloat(in_keys=[...])")
 
     def _require(self, key: NestedKey, dtype: torch.dtype, size: int | None, remedy: str) -> None:
         spec = self.specs.get(key)
@@ -61,20 +61,20 @@ class Entries:
             self.problems.append(f"{rule}, got {describe(spec)}; {remedy}")
 
     def check(self, reader: str) -> None:
-        """Ends with one message if something was wrong.
+        """Raises one error for all problems, if there were any.
 
         Args:
-            reader: who reads the entries.
+            reader: what reads the entries, for the message.
 
         Raises:
-            ValueError: naming all problems, and all that the environment has.
+            ValueError: with all problems, and all entries that the environment has.
         """
         if self.problems:
             found = "\n".join(f"    {key!r}: {describe(spec)}" for key, spec in self.specs.items())
             wrong = "\n".join(f"  - {problem}" for problem in self.problems)
             raise ValueError(
-                f"env must have what {reader} reads:\n{wrong}\n  Entries that have another name can be given the right "
-                f"one with RenameTransform. The environment, of batch size {list(self.batch_size)}, has\n{found}"
+                f"env must have what {reader} reads:\n{wrong}\n  Use RenameTransform for entries that have another "
+                f"name. The environment, of batch size {list(self.batch_size)}, has\n{found}"
             )
 
 
@@ -88,7 +88,7 @@ def _name(dtype: torch.dtype) -> str:
 
 
 def set_spec(composite: Composite, key: NestedKey, spec: TensorSpec) -> None:
-    """Sets a nested spec, making the composites on its way."""
+    """Sets a nested spec, creating the composites that hold it."""
     if isinstance(key, tuple) and len(key) > 1:
         if composite.get(key[0], None) is None:
             composite[key[0]] = Composite(shape=composite.shape, device=composite.device)

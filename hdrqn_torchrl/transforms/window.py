@@ -1,4 +1,4 @@
-"""What an agent sees of a screen: a window around it."""
+"""A window around the agent, cut out of the screen."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from hdrqn_torchrl.devices import on_host
 
 
 class Window(Transform):
-    """Cuts a square window around the agent out of a screen and resizes it (section IV-D: 70x70 to 44x44 pixels).
+    """Cuts a square window around the agent out of the screen and resizes it (section IV-D: 70x70 to 44x44 pixels).
 
-    TorchRL's ``CenterCrop`` and ``Resize`` know no place that moves with the agent, hence this transform.
+    TorchRL's ``CenterCrop`` and ``Resize`` can't follow the agent, hence this transform.
 
     Args:
         view: side of the window in pixels, black beyond the edges of the screen; ``None``: the whole screen.
-        size: side of the image.
-        keep_pixels: keep the screen; else it is gone after the window was cut out.
+        size: side of the resulting image in pixels.
+        keep_pixels: whether to keep the entry with the screen.
         pixels_key: screen ``[*batch, height, width, C]`` uint8.
         position_key: the agent's centre, x and y in pixels ``[*batch, 2]``; not read for the whole screen.
-        out_key: image ``[*batch, C, size, size]`` uint8.
+        out_key: resulting image ``[*batch, C, size, size]`` uint8.
 
     Raises:
         ValueError: if ``view`` or ``size`` is not positive.
@@ -52,9 +52,9 @@ class Window(Transform):
         out_key: NestedKey = keys.OBSERVATION,
     ) -> None:
         if view is not None and view < 1:
-            raise ValueError(f"view must be >= 1 or None, got {view}; the paper's is 70, None shows the whole screen.")
+            raise ValueError(f"view must be >= 1 or None, got {view}; use 70 as in the paper, or None for all.")
         if size < 1:
-            raise ValueError(f"size must be >= 1, got {size}; the paper's is 44.")
+            raise ValueError(f"size must be >= 1, got {size}; use 44 as in the paper.")
         super().__init__(in_keys=[pixels_key, position_key], out_keys=[out_key])
         self.view, self.size, self.keep_pixels = view, size, keep_pixels
         self.pixels_key, self.position_key, self.out_key = pixels_key, position_key, out_key
@@ -82,15 +82,15 @@ class Window(Transform):
 
 
 def cut_out(pixels: Tensor, position: Tensor, view: int) -> Tensor:
-    """Windows around places on screens, black beyond their edges.
+    """Windows around given positions on screens, black beyond the edges.
 
     Args:
-        pixels: ``[*, height, width, C]``.
+        pixels: screens ``[*, height, width, C]``.
         position: x and y of the centres ``[*, 2]``.
         view: side of the window.
 
     Returns:
-        ``[*, view, view, C]``.
+        Windows ``[*, view, view, C]``.
     """
     height, width, channels = pixels.shape[-3:]
     flat = pixels.reshape(-1, height, width, channels)
@@ -105,9 +105,9 @@ def cut_out(pixels: Tensor, position: Tensor, view: int) -> Tensor:
 
 
 def resized(pixels: Tensor, size: int) -> Tensor:
-    """Screens ``[*, height, width, C]`` as square images ``[*, C, size, size]``, bilinear with antialiasing.
+    """Resizes screens ``[*, height, width, C]`` to images ``[*, C, size, size]``, bilinear with antialiasing.
 
-    The same values on every device.
+    The result is the same on every device.
     """
     batch = pixels.shape[:-3]
     images = pixels.reshape(-1, *pixels.shape[-3:]).permute(0, 3, 1, 2)
@@ -119,10 +119,11 @@ def resized(pixels: Tensor, size: int) -> Tensor:
 
 
 def interpolated(images: Tensor, size: int) -> Tensor:
-    """What ``interpolate`` makes of uint8 images on a CPU, value for value, on any device.
+    """The exact result of ``interpolate`` for uint8 images on a CPU, on any device.
 
-    Only a CPU has a kernel for them. It takes a weighted mean of the columns, then of the rows, as Pillow does: with
-    weights that are multiples of a power of two, and a result that is rounded. Such sums are exact in float64.
+    PyTorch has a kernel for uint8 images on CPUs only. It takes a weighted mean of the columns, then of the rows, as
+    Pillow does, with weights that are multiples of a power of two, and rounds the result. These sums are exact in
+    float64.
 
     Args:
         images: ``[N, C, height, width]`` uint8.
@@ -136,7 +137,7 @@ def interpolated(images: Tensor, size: int) -> Tensor:
 
 
 def _along_rows(images: Tensor, size: int) -> Tensor:
-    """``[*, height, width]`` -> ``[*, height, size]``, whole numbers as float64."""
+    """``[*, height, width]`` -> ``[*, height, size]``; integers held as float64."""
     if images.shape[-1] == size:
         return images
     weights, unit = _weights(images.shape[-1], size, images.device)
@@ -145,10 +146,10 @@ def _along_rows(images: Tensor, size: int) -> Tensor:
 
 @cache
 def _weights(length: int, size: int, device: torch.device) -> tuple[Tensor, int]:
-    """How much of each of ``length`` pixels goes into each of ``size``, ``[length, size]`` float64, in parts of a unit.
+    """Integer weights of ``length`` pixels in each of ``size`` pixels, ``[length, size]`` float64, and their unit.
 
-    A triangle around a pixel's centre, as wide as two pixels of the coarser grid. The unit is the largest power of two
-    for which weights fit into 16 bits.
+    The weights of a pixel form a triangle around its centre, as wide as two pixels of the coarser grid. The unit (what
+    stands for 1) is the largest power of two for which the weights fit into 16 bits.
     """
     scale = length / size
     reach = max(scale, 1.0)
@@ -157,7 +158,7 @@ def _weights(length: int, size: int, device: torch.device) -> tuple[Tensor, int]
         centre = scale * (pixel + 0.5)
         touched = range(max(int(centre - reach + 0.5), 0), min(int(centre + reach + 0.5), length))
         triangle = [max(0.0, 1.0 - abs((place - centre + 0.5) * (1.0 / reach))) for place in touched]
-        *_, total = accumulate(triangle)  # in this order; sum() is more exact than the CPU's kernel
+        *_, total = accumulate(triangle)  # sums in this order, like the CPU's kernel; sum() would be more exact
         weights[touched.start : touched.stop, pixel] = torch.tensor(triangle, dtype=torch.float64) / total
     largest, unit = weights.max().item(), 1
     while unit < 2**22 and int(0.5 + largest * 2 * unit) < 2**15:

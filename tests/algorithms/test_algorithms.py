@@ -187,7 +187,7 @@ class TestSequencesOfV3:
 
     @pytest.mark.parametrize("env", [small_env(2, max_steps=201), Corridor(2, length=6)], ids=["long", "unknown"])
     def test_of_longer_episodes_they_are_short_and_begin_anywhere_from_stored_states(self, env):
-        with pytest.warns(UserWarning, match=r"sequences of 32 steps that begin anywhere, .* give slice_len to have"):
+        with pytest.warns(UserWarning, match=r"sequences of 32 steps that begin anywhere, .* give slice_len for"):
             settings = self.settings(env)
         assert (settings.slice_len, settings.sampling, settings.stored_state) == (32, "steps", True)
         assert settings.burn_in == 0.25
@@ -578,7 +578,7 @@ class TestStoredStates:
 
     @pytest.mark.parametrize("name", ["dqn", "hdqn"])
     def test_a_network_without_any_is_refused(self, name):
-        with pytest.raises(ValueError, match="stored_state must be False without recurrence, got True; "):
+        with pytest.raises(ValueError, match="stored_state must be False for networks without memory, got True; "):
             build(name, small_env(2), settings=tiny_settings(stored_state=True))
 
 
@@ -734,7 +734,7 @@ class TestV3:
     @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
     def test_targets_of_the_learner_are_refused(self, settings):
         with pytest.raises(
-            ValueError, match=r"trace_decay and n_step must be left at 0 and 1 for v3, got .*; its loss"
+            ValueError, match=r"trace_decay and n_step must be left at 0 and 1 for v3, got .*; use v3's own"
         ):
             self.make(learner=settings)
 

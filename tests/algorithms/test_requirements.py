@@ -44,7 +44,7 @@ class TestActions:
     @pytest.mark.parametrize("name", EVERY)
     def test_one_hot_actions_are_refused_with_the_setting_that_helps(self, name):
         message = refusal(name, Corridor(N, odd={"action": OneHot(2, shape=(N, 2))}))
-        assert "'action' must be one number of n, [4] int64 (Categorical), got [4, 2] bool (OneHot)" in message
+        assert "'action' must be one integer below n, [4] int64 (Categorical), got [4, 2] bool (OneHot)" in message
         assert "pass categorical_action_encoding=True to GymEnv or GymWrapper" in message
 
     def test_gymnasium_s_own_wrapper_is_refused_with_its_default_and_only_then(self):
@@ -57,11 +57,11 @@ class TestActions:
     @pytest.mark.parametrize(
         ("spec", "remedy"),
         [
-            (MultiCategorical([2, 3], shape=(N, 2)), "give each combination of its parts one number"),
-            (MultiOneHot([2, 3], shape=(N, 5)), "give each combination of its parts one number"),
+            (MultiCategorical([2, 3], shape=(N, 2)), "number the combinations of its parts"),
+            (MultiOneHot([2, 3], shape=(N, 5)), "number the combinations of its parts"),
             (Bounded(-1, 1, shape=(N, 2)), "ActionDiscretizer"),
-            (Binary(shape=(N, 3), dtype=torch.int8), "give each combination of its bits one number"),
-            (Categorical(2, shape=(N, 1)), "let it have the environment's batch size"),
+            (Binary(shape=(N, 3), dtype=torch.int8), "number the combinations of its bits"),
+            (Categorical(2, shape=(N, 1)), "give it the environment's batch size"),
         ],
         ids=lambda value: type(value).__name__,
     )
@@ -133,7 +133,7 @@ class TestObservations:
     @pytest.mark.parametrize("name", ["drqn", "v2", "v3"])
     def test_what_cannot_be_guessed_is_not_predicted(self, name):
         env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
-        with pytest.raises(ValueError, match=r"prediction_steps must be 0 where .*, got 3 for \[4, 4\]"):
+        with pytest.raises(ValueError, match=r"prediction_steps must be 0 if .*, got 3 for \[4, 4\]"):
             build(name, env, PLAIN, prediction_steps=3)
         build(name, env, PLAIN, prediction_steps=0)
 
@@ -166,7 +166,7 @@ class TestGymnasium:
 
     def test_vectors_that_reset_themselves_in_the_same_step_are_for_plain_observations(self):
         message = refusal("v2", self.walks("SAME_STEP"))
-        assert "got autoreset_mode=SAME_STEP; use AutoresetMode.DISABLED" in message
+        assert "must be DISABLED, got SAME_STEP; pass AutoresetMode.DISABLED" in message
         vector = gymnasium.make_vec(
             "CartPole-v1", 2, "sync", {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
         )

@@ -54,7 +54,7 @@ def test_a_task_with_fewer_sets_of_subgoals_is_refused():
 
 
 def test_a_bonus_is_for_flat_agents():
-    with pytest.raises(ValueError, match=r"bonus_reward must be 0 with levels=2, got 0\.5: their critic"):
+    with pytest.raises(ValueError, match=r"bonus_reward must be 0 with levels=2, got 0\.5; their critic"):
         agent(house(), 2, bonus_reward=0.5)
     assert agent(house(), 1, bonus_reward=0.5).learners["joint"].loss.rules[0].largest_return == float("inf")
 
