@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from tensordict import TensorDictBase
@@ -12,114 +12,11 @@ from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import Algorithm, LevelView
+from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.modules import EpsilonGreedy, writing_values
-from hdrqn_torchrl.rendering.scenes import Scene, scene_of
+from hdrqn_torchrl.rendering.frames import Decision, Frame, Pursuit, Score
+from hdrqn_torchrl.rendering.scenes import scene_of, subgoal_names
 from hdrqn_torchrl.runs.isolation import isolated
-
-
-@dataclass(frozen=True)
-class Decision:
-    """One epsilon-greedy choice: the Q-values, which of them were allowed, and what was chosen."""
-
-    values: tuple[float, ...]
-    allowed: tuple[bool, ...]
-    choice: int
-
-    @property
-    def best(self) -> int:
-        """The greedy choice."""
-        among = [index for index, allowed in enumerate(self.allowed) if allowed] or range(len(self.values))
-        return max(among, key=lambda index: self.values[index])
-
-    @property
-    def explores(self) -> bool:
-        """Whether chance chose something else than the best."""
-        return self.choice != self.best
-
-
-@dataclass(frozen=True)
-class Pursuit:
-    """A subgoal in force.
-
-    Attributes:
-        level: name of the level that chose it.
-        names: of the subgoals among which it was chosen.
-        decision: Q-values and choice, from when the option began.
-        steps: how many steps the option has lasted.
-    """
-
-    level: str
-    names: tuple[str, ...]
-    decision: Decision
-    steps: int = 0
-
-    @property
-    def name(self) -> str:
-        """Name of the subgoal."""
-        return self.names[self.decision.choice]
-
-
-@dataclass(frozen=True)
-class Score:
-    """What an episode has brought so far.
-
-    Attributes:
-        reached: subgoals reached ``[G]``, of the farthest set.
-        intrinsic: sum of r^in as actions are paid; ``None`` for flat agents.
-        steps: steps of the episode.
-        total: sum of the task's total reward, the episode's return.
-        extrinsic: sum of r^ex.
-        option_intrinsic: sum of r^in since the nearest option began.
-    """
-
-    reached: tuple[bool, ...]
-    intrinsic: float | None
-    steps: int = 0
-    total: float = 0.0
-    extrinsic: float = 0.0
-    option_intrinsic: float = 0.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Frame:
-    """One moment of a recorded episode: the world and the decision taken in it.
-
-    The last frame of an episode has an ``outcome``; it shows the world after the last step and repeats the decision
-    that led there.
-
-    Attributes:
-        scene: world and view.
-        episode: counts from 1.
-        episodes: how many are recorded.
-        max_steps: step limit of an episode, if there is one.
-        score: what came in before this decision.
-        action: Q-values of actions, and the action.
-        pursuits: subgoals in force, from near to far; none for flat agents.
-        event: what the step before did; empty if nothing worth telling.
-        outcome: how the episode ended; empty while it is played.
-        success: whether it ended with the whole task completed.
-    """
-
-    scene: Scene
-    episode: int
-    episodes: int
-    max_steps: int | None
-    score: Score
-    action: Decision
-    pursuits: tuple[Pursuit, ...] = ()
-    event: str = ""
-    outcome: str = ""
-    success: bool = False
-
-    @property
-    def subgoal(self) -> Decision | None:
-        """Q-values and choice of the farthest subgoal; ``None`` for flat agents."""
-        return self.pursuits[-1].decision if self.pursuits else None
-
-    @property
-    def starts_option(self) -> bool:
-        """Whether a subgoal was chosen in this very moment."""
-        return any(pursuit.steps == 0 for pursuit in self.pursuits)
 
 
 @torch.no_grad()
@@ -172,6 +69,7 @@ def record_episodes(
 def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> Iterator[Frame]:
     """The frames of one episode."""
     base, tensordict = getattr(env, "base_env", env), env.reset()
+    max_steps, draws_subgoals = task_of(env).max_steps, _draws_subgoals(base, algorithm)
     own, *above = algorithm.levels
     score = Score((False,) * len(_attained(tensordict[0])), intrinsic=None if own.reward_key is None else 0.0)
     pursuits: tuple[Pursuit, ...] = ()
@@ -184,10 +82,15 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> It
             score = replace(score, option_intrinsic=0.0)
         action = _decision(own, now)
         frame = Frame(
-            scene=scene_of(base, subgoal=_choice(pursuits), action=action.choice),
+            scene=scene_of(
+                base,
+                subgoal=pursuits[-1].decision.choice if draws_subgoals else None,
+                action=action.choice,
+                observation=now.get(keys.OBSERVATION, None),
+            ),
             episode=episode,
             episodes=episodes,
-            max_steps=getattr(base, "max_steps", None),
+            max_steps=max_steps,
             score=score,
             action=action,
             pursuits=pursuits,
@@ -199,7 +102,8 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> It
         pursuits = tuple(replace(pursuit, steps=pursuit.steps + 1) for pursuit in pursuits)
         score, event = _add(score, own, after), _tell(frame, above, after)
         if after[keys.DONE]:
-            yield _last(replace(frame, score=score, event=event, pursuits=pursuits), base, after)
+            subgoal = pursuits[-1].decision.choice if draws_subgoals else None
+            yield _last(replace(frame, score=score, event=event, pursuits=pursuits), base, subgoal, after)
             return
         tensordict = env.step_mdp(tensordict)
 
@@ -219,20 +123,20 @@ def _decision(view: LevelView, now: TensorDictBase) -> Decision:
     return Decision(tuple(values.tolist()), tuple(allowed.tolist()), int(now[view.choice_key]))
 
 
-def _last(frame: Frame, base: EnvBase, after: TensorDictBase) -> Frame:
+def _last(frame: Frame, base: EnvBase, subgoal: int | None, after: TensorDictBase) -> Frame:
     """The end of an episode: the world after the last step."""
     success = _happened(after, keys.SUCCESS)
     return replace(
         frame,
-        scene=scene_of(base, subgoal=_choice(frame.pursuits)),
+        scene=scene_of(base, subgoal=subgoal, observation=after.get(keys.OBSERVATION, None)),
         outcome=frame.scene.outcome(success, bool(after[keys.TERMINATED])),
         success=success,
     )
 
 
-def _choice(pursuits: Sequence[Pursuit]) -> int | None:
-    """The farthest subgoal."""
-    return pursuits[-1].decision.choice if pursuits else None
+def _draws_subgoals(base: EnvBase, algorithm: Algorithm) -> bool:
+    """Whether the agent's farthest subgoals are those that the bare environment draws; a critic may have others."""
+    return len(algorithm.levels) > 1 and algorithm.levels[-1].choice_names == subgoal_names(base, task_of(base))
 
 
 def _add(score: Score, own: LevelView, after: TensorDictBase) -> Score:
@@ -253,7 +157,8 @@ def _add(score: Score, own: LevelView, after: TensorDictBase) -> Score:
 def _tell(frame: Frame, above: Sequence[LevelView], after: TensorDictBase) -> str:
     """What a step did, in a few words."""
     told = []
-    for name, attained in zip(frame.scene.subgoal_names, _attained(after), strict=False):
+    names = frame.pursuits[-1].names if frame.pursuits else frame.scene.subgoal_names
+    for name, attained in zip(names, _attained(after), strict=False):
         if attained:
             told.append(f"{name} reached, rᵉˣ {_extrinsic_reward(after):+.2f}")
     if _happened(after, keys.HAZARD):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import NamedTuple
 
-from hdrqn_torchrl.rendering.episodes import Decision, Frame, Pursuit
+from hdrqn_torchrl.rendering.frames import Decision, Frame, Pursuit
 from hdrqn_torchrl.rendering.style import Colour
 
 ACTION_COLOUR = (32, 32, 32)
@@ -85,8 +85,10 @@ def levels_of(frame: Frame, spans: BarSpans) -> list[Level]:
         ink = [ACTION_COLOUR] * len(nearer.names)
         levels.insert(0, Level("by way of", "Q", nearer.decision, nearer.names, ink, 1.0, _note(nearer), brief=True))
     if frame.pursuits:
-        farthest, names, colours = frame.pursuits[-1], scene.subgoal_names, scene.subgoal_colours
-        levels.insert(0, Level("wants", "Qᴹ", farthest.decision, names, colours, spans.subgoal, _note(farthest)))
+        farthest = frame.pursuits[-1]
+        drawn = farthest.names == scene.subgoal_names
+        ink = list(scene.subgoal_colours) if drawn else [ACTION_COLOUR] * len(farthest.names)
+        levels.insert(0, Level("wants", "Qᴹ", farthest.decision, farthest.names, ink, spans.subgoal, _note(farthest)))
     return levels
 
 
@@ -102,7 +104,7 @@ def caption(frame: Frame) -> str:
     if frame.outcome:
         told.append(f"{frame.outcome}, return {frame.score.total:.2f}")
     elif frame.subgoal is not None and frame.pursuits[-1].steps == 0:
-        told.append(f"chooses {frame.scene.subgoal_names[frame.subgoal.choice]}")
+        told.append(f"chooses {frame.pursuits[-1].name}")
     return "; ".join(part for part in told if part)
 
 

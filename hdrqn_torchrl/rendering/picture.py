@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from hdrqn_torchrl.rendering.episodes import Frame
+from hdrqn_torchrl.rendering.frames import Frame
 from hdrqn_torchrl.rendering.levels import BarSpans, Level, caption, levels_of
 from hdrqn_torchrl.rendering.style import font
 

@@ -10,7 +10,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from hdrqn_torchrl.rendering.episodes import Frame
+from hdrqn_torchrl.rendering.frames import Frame
 from hdrqn_torchrl.rendering.levels import BarSpans, Level, bar_spans, caption, levels_of
 from hdrqn_torchrl.rendering.video import check_video, hold
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from hdrqn_torchrl.rendering.episodes import Frame
+from hdrqn_torchrl.rendering.frames import Frame
 from hdrqn_torchrl.rendering.levels import bar_spans
 from hdrqn_torchrl.rendering.picture import HEIGHT, WIDTH, draw_frame
 

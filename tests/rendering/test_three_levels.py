@@ -1,6 +1,7 @@
 """A scripted agent of three levels is watched: two places besides the goals of the corridor."""
 
 import io
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -8,6 +9,7 @@ import torch
 from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
 
 from hdrqn_torchrl.algorithms import Algorithm, make_v3
 from hdrqn_torchrl.algorithms.base import copies_of
@@ -21,6 +23,9 @@ from hdrqn_torchrl.transforms import Critic, SubgoalTransform
 
 PLACES, GOALS = SubgoalSet(names=("cave", "mud"), prefix="places", repeatable=True), SubgoalSet(names=("1", "2"))
 VALUES = {"action": [0.0, 0.1, 0.2, 0.5], "places_subgoal": [0.25, 0.75], "subgoal": [1.0, 0.5]}
+
+
+NAMES = ("all", "bumped", "over")
 
 
 class Scripted(TensorDictModuleBase):
@@ -114,6 +119,25 @@ def test_an_agent_of_three_levels_shows_the_values_that_each_level_chose_by():
         for decision in (frame.action, *(pursuit.decision for pursuit in frame.pursuits)):
             assert decision.choice == decision.best and len(set(decision.values)) > 1
     assert draw_frame(played[0], bar_spans(played)).any()
+
+
+def test_subgoals_of_a_critic_that_the_scene_does_not_draw_are_named_as_the_critic_names_them():
+    critic = Critic(3, lambda after: torch.cat([after["success"], after["hazard"], after["done"]], -1), names=NAMES)
+    env = TransformedEnv(MultiGoalGridEnv(1, view=3, max_steps=20, seed=0), critic)
+    agent = make_v3(env, compact_network(8, (8,)), memory_size=8, head_size=8)
+    played = record_episodes(agent.transform(env), agent, epsilon=1.0)
+    assert {frame.pursuits[-1].names for frame in played} == {NAMES} and {frame.max_steps for frame in played} == {20}
+    assert any("bumped reached" in frame.event for frame in played)
+    assert draw_frame(played[0], bar_spans(played)).any()
+
+
+def test_a_task_without_a_scene_shows_what_the_agent_sees():
+    env = MultiGoalGridEnv(1, view=3, max_steps=5)
+    env.task = replace(env.task, scene=None)
+    agent = make_v3(env, compact_network(8, (8,)), memory_size=8, head_size=8)
+    frames = record_episodes(agent.transform(env), agent)
+    assert all(frame.scene.observation.shape == (3, 3) for frame in frames)
+    assert (draw_frame(frames[0]) != draw_frame(frames[-1])).any()
 
 
 def test_an_agent_that_tells_no_levels_is_refused():
