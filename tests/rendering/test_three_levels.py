@@ -2,7 +2,7 @@
 
 import io
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
@@ -11,7 +11,7 @@ from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from hdrqn_torchrl.algorithms import Algorithm, make_v3
+from hdrqn_torchrl.algorithms import Algorithm, make_hdrqn, make_v3
 from hdrqn_torchrl.algorithms.base import copies_of
 from hdrqn_torchrl.algorithms.levels import make_levels
 from hdrqn_torchrl.algorithms.views import views_of
@@ -108,9 +108,10 @@ def test_pictures_and_text_have_a_line_for_the_level_between():
     assert "by way of mud" in console.export_text()
 
 
-def test_an_agent_of_three_levels_shows_the_values_that_each_level_chose_by():
+@pytest.mark.parametrize("make", [make_v3, partial(make_hdrqn, version="v1"), partial(make_hdrqn, version="v2")])
+def test_an_agent_of_three_levels_shows_the_values_that_each_level_chose_by(make):
     env = MultiGoalGridEnv(1, layout="nine_rooms", view=3, max_steps=12, seed=0)
-    agent = make_v3(env, compact_network(8, (8,)), levels=3, memory_size=8, head_size=8)
+    agent = make(env, compact_network(8, (8,)), levels=3)
     *played, last = record_episodes(agent.transform(env), agent)
     rooms, goals = env.task.subgoals
     assert len(played) == 12 and last.outcome
