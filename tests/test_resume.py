@@ -1,5 +1,6 @@
 """A training that was stopped and resumed is, bit for bit, the one that was not."""
 
+import os
 import random
 import shutil
 import signal
@@ -11,7 +12,6 @@ import pytest
 from helpers import check_same, check_same_checkpoint, house, make_training, seed_everything, table
 
 from hdrqn_torchrl.learning import PhaseOne
-from hdrqn_torchrl.runs import checkpoint
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.interruption import Interrupted
 
@@ -146,7 +146,7 @@ CUTS = {
 def memory_for_disk():
     """What is tested here does not depend on fsync, which takes most of the time of a small checkpoint."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(checkpoint.os, "fsync", lambda _: None)
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 
