@@ -19,7 +19,8 @@ from programs import TINY, TINY_HDRQN
 from safetensors.torch import load_file, save_file
 from torchrl.checkpoint import CheckpointError
 
-from hdrqn_torchrl.cli import evaluate, plot, report, train
+from hdrqn_torchrl.analysis import archives
+from hdrqn_torchrl.cli import evaluate, findings, plot, train
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.runs.arguments import SettingsError
@@ -91,7 +92,7 @@ def plotted(run):
 
 def reported(run):
     with ExitStack() as stack:
-        report.read_runs([str(run)], stack)
+        findings.read_runs([str(run)], stack)
 
 
 READERS = {"evaluate": evaluated, "resume": resumed, "plot": plotted, "report": reported}
@@ -391,17 +392,17 @@ def archive_of(members, path):
     ids=lambda members: str(list(members))[:30],
 )
 def test_an_archive_holds_files_of_runs_and_nothing_else(run, monkeypatch, members):
-    monkeypatch.setattr(report, "LARGEST_ARCHIVE", 2 << 20)
+    monkeypatch.setattr(archives, "LARGEST_ARCHIVE", 2 << 20)
     path = archive_of(members, run.parent / "runs.tar.xz")
     with (
         at_once(),
         ExitStack() as stack,
         pytest.raises(SettingsError, match=r"runs must name folders or readable archives"),
     ):
-        report.read_runs([str(path)], stack)
+        findings.read_runs([str(path)], stack)
 
 
 def test_an_archive_of_no_archive(run):
     (run.parent / "runs.tar.xz").write_bytes(b"text")
     with ExitStack() as stack, pytest.raises(SettingsError, match="readable archives"):
-        report.read_runs([str(run.parent / "runs.tar.xz")], stack)
+        findings.read_runs([str(run.parent / "runs.tar.xz")], stack)

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 import hdrqn_torchrl
+from hdrqn_torchrl.runs import layout
 
 ORDER = (
     "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "algorithms", "runs",
@@ -45,3 +46,22 @@ def test_only_the_programs_import_hydra(path):
 
 def test_every_part_has_its_place():
     assert {part_of(path) for path in FILES} == set(ORDER)
+
+
+def texts_of(path):
+    """All texts in a file's code, and those at the end of a path; docstrings are none."""
+    tree = ast.parse(path.read_text())
+    docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+    return {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docs
+    }
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_one_module_knows_the_names_of_what_a_run_folder_holds(path):
+    names = {*layout.WRITTEN, layout.CHECKPOINTS, layout.EVALUATIONS}
+    if path == Path(layout.__file__) or path.name == "configuration.py":  # conf/ has a config.yaml, too
+        return
+    assert not texts_of(path) & names

@@ -9,20 +9,16 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hdrqn_torchrl.analysis.results import Run
+from hdrqn_torchrl.runs.comparing import NOT_COMPARED, NOT_THE_TASK, flat
 
 NONE = "none"
 """Label of a setting that a run does not have."""
-_NOT_THE_TASK = {"num_envs", "seed", "device"}  # settings of the environment that leave the task as it is
-_MAY_DIFFER = {  # settings that do not make runs incomparable
-    "seed", "device", "threads", "logger", "log_frames", "evaluation", "checkpoint", "output_root", "resume",
-    "resume_override", "allowed_targets",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,7 +71,7 @@ def rows_of(entries: Sequence[Entry], by: Sequence[str] = ("algo",), *, pool: bo
 def task_of(entry: Entry) -> dict[str, Any]:
     """The settings of the environment that make a run's task."""
     env = entry.settings.get("env") or {}
-    return {key: value for key, value in env.items() if key not in _NOT_THE_TASK}
+    return {key: value for key, value in env.items() if key not in NOT_THE_TASK}
 
 
 def task_key(entry: Entry, without: Set[str] = frozenset()) -> str:
@@ -107,24 +103,17 @@ def value_of(entry: Entry, key: str) -> str:
 
 def differences(entries: Sequence[Entry]) -> list[str]:
     """Settings beside task and seed in which runs differ, outermost first."""
-    flat = []
-    for entry in entries:
-        settings = {key: value for key, value in entry.settings.items() if key not in _MAY_DIFFER}
-        env = entry.settings.get("env") or {}
-        settings["env"] = {key: env[key] for key in ("num_envs",) if key in env}
-        flat.append(dict(_flattened(settings)))
-    keys = dict.fromkeys(key for each in flat for key in each)
+    found = [_compared(entry.settings) for entry in entries]
+    keys = dict.fromkeys(key for each in found for key in each)
     return sorted(
-        (key for key in keys if len({_text(each.get(key)) for each in flat}) > 1), key=lambda key: key.count(".")
+        (key for key in keys if len({_text(each.get(key)) for each in found}) > 1), key=lambda key: key.count(".")
     )
 
 
-def _flattened(settings: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in settings.items():
-        if isinstance(value, dict):
-            yield from _flattened(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+def _compared(settings: dict[str, Any]) -> dict[str, Any]:
+    """By full names; of the environment only how many worlds there are, as the rest of it is the task."""
+    found = flat(settings, without=NOT_COMPARED)
+    return {key: value for key, value in found.items() if not key.startswith("env.") or key == "env.num_envs"}
 
 
 def _labels(entries: Sequence[Entry], by: Sequence[str]) -> list[str]:

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.files import RunFileError, read_json, read_text
 
 Metrics = dict[str, list[float]]
 References = dict[str, dict[str, float]]
 Array = NDArray[np.floating[Any]]
 
-METRICS_FILE = "metrics.csv"
 LARGEST_WIDTH = 10_000  # columns; 100 subgoals have as many legs
 _SHARES = ("success", "in_order")
 _UNTIL = re.compile(r"(?P<axis>frames|episodes|updates|wall_seconds) until (?P<column>\S+) *>= *(?P<level>-?[\d.]+)")
@@ -51,7 +51,7 @@ def find_runs(patterns: Iterable[str]) -> list[Path]:
     found: set[Path] = set()
     for pattern in patterns:
         pattern = glob.escape(pattern) if Path(pattern).exists() else pattern  # folders may have brackets in their name
-        start = pattern.removesuffix(METRICS_FILE).rstrip("/").removesuffix("**").rstrip("/")
+        start = pattern.removesuffix(layout.METRICS).rstrip("/").removesuffix("**").rstrip("/")
         root = str(Path(start).expanduser()) if start else "/" if pattern.startswith("/") else "."
         for place in glob.iglob(root, recursive=True):  # noqa: PTH207  (Path.glob wants relative ones)
             found.update(_runs_below(Path(place)))
@@ -61,10 +61,10 @@ def find_runs(patterns: Iterable[str]) -> list[Path]:
 def _runs_below(place: Path) -> Iterator[Path]:
     """Run folders at or below a folder; links to run folders count, others are not followed: they may lead round."""
     for folder, inner, files in os.walk(place):
-        if METRICS_FILE in files:
+        if layout.METRICS in files:
             yield Path(folder)
         for each in map(Path(folder).joinpath, inner):
-            if each.is_symlink() and (each / METRICS_FILE).exists():
+            if each.is_symlink() and (each / layout.METRICS).exists():
                 yield each
 
 
@@ -105,18 +105,18 @@ def read_run(folder: Path) -> Run:
         ValueError: if a file is broken, or there is no complete log point yet.
         OSError: if a file can't be read.
     """
-    metrics = {name: np.array(column) for name, column in read_metrics(folder / METRICS_FILE).items()}
+    metrics = {name: np.array(column) for name, column in read_metrics(folder / layout.METRICS).items()}
     frames = metrics.get("frames", np.empty(0))
     if not len(frames):
-        raise ValueError(f"{folder / METRICS_FILE} has no complete log point (a row with its frames) yet.")
+        raise ValueError(f"{folder / layout.METRICS} has no complete log point (a row with its frames) yet.")
     if not np.isfinite(frames).all():
-        raise ValueError(f"{folder / METRICS_FILE} must tell the frames of every row, got {frames.tolist()[:10]}.")
+        raise ValueError(f"{folder / layout.METRICS} must tell the frames of every row, got {frames.tolist()[:10]}.")
     kept = frames <= _least_from_here(frames)
     return Run(
         folder,
         {name: column[kept] for name, column in metrics.items()},
-        _read_summary(folder / "summary.json", frames[-1]),
-        (folder / "error.txt").exists(),
+        _read_summary(folder / layout.SUMMARY, frames[-1]),
+        (folder / layout.ERROR).exists(),
     )
 
 

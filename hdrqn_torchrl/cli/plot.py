@@ -54,6 +54,7 @@ from hdrqn_torchrl.analysis.results import (
     source_of,
 )
 from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import TARGET, SettingsError
 from hdrqn_torchrl.runs.reading import read_choices
 from hdrqn_torchrl.runs.stored_settings import read_settings
@@ -119,7 +120,7 @@ def check(settings: Settings) -> None:
     for name in as_list(settings.out):
         if Path(str(name)).suffix.lower() not in ENDINGS:
             raise SettingsError(f"out must end in one of {', '.join(ENDINGS)}, got {name!r}.")
-        if Path(str(name)).name == "metrics.csv":
+        if Path(str(name)).name == layout.METRICS:
             raise SettingsError(f"out must not have the name of a run's own data, got {name!r}; use table.csv.")
 
 
@@ -160,7 +161,7 @@ def read_entries(patterns: list[str]) -> list[Entry]:
 
 def read_entry(folder: Path) -> Entry:
     """A run folder; one without settings is drawn, too."""
-    run, path = read_run(folder), folder / "config.yaml"
+    run, path = read_run(folder), folder / layout.CONFIG
     settings = read_settings(path, keep_unknown=True) if path.exists() else {}
     return Entry(run, settings, read_choices(folder))
 

@@ -17,33 +17,30 @@ python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_
 
 from __future__ import annotations
 
-import json
-import lzma
 import re
-import tarfile
-import tempfile
 from contextlib import ExitStack
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from omegaconf import MISSING
 from PIL import Image
 
+from hdrqn_torchrl.analysis.archives import keep
 from hdrqn_torchrl.analysis.claims import Results
 from hdrqn_torchrl.analysis.comparison import plot_curves
 from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves, estimate_finals
 from hdrqn_torchrl.analysis.figures import plot_legs_over_time
-from hdrqn_torchrl.analysis.grouping import Entry, value_of
+from hdrqn_torchrl.analysis.grouping import value_of
 from hdrqn_torchrl.analysis.results import final_value
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.cli.plot import as_list, common_references, note, read_entries
-from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Job, Study, flat, is_run_of, jobs_of
+from hdrqn_torchrl.cli.findings import Found, Runs, read_runs, runs_of_jobs
+from hdrqn_torchrl.cli.plot import as_list, common_references, note
+from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.files import RunFileError, read_json
 
-LARGEST_ARCHIVE = 256 << 20  # bytes, unpacked; a hundred times what all studies take
-KEPT = ("config.yaml", "run.json", "metrics.csv", "summary.json", "evaluations/*.json")
 SIZES = ("small", "paper")
 QUANTITIES = ("return", "success", "in_order", "steps")
 HEADER = (
@@ -67,21 +64,6 @@ class Settings:
     size: str = "small"
     studies: Any = None
     keep: str | None = None
-
-
-@dataclass(frozen=True)
-class Found:
-    """A run."""
-
-    entry: Entry
-    settings: dict[str, Any]
-    """As :func:`studies.flat` gives them."""
-    origin: dict[str, Any]
-    """``run.json``"""
-
-
-Runs = list[tuple[Job, Found]]
-"""Runs of a study and what each stands for in it; a run may stand for something in several studies."""
 
 
 def run(settings: Settings) -> None:
@@ -112,81 +94,9 @@ def run(settings: Settings) -> None:
         if not settings.studies:
             text = put(text, f"claims {settings.size}", "\n".join(overview))
         if settings.keep:
-            keep(list(used.values()), Path(settings.keep))
+            ordered = sorted(used.values(), key=lambda run: sorted(map(str, run.settings.items())))
+            keep([run.entry.run.folder for run in ordered], Path(settings.keep))
     out.write_text(text)
-
-
-def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
-    """All runs below folders and in archives; archives are unpacked for as long as ``stack`` lasts."""
-    places = []
-    for pattern in patterns:
-        if pattern.endswith(".tar.xz"):
-            unpacked = stack.enter_context(tempfile.TemporaryDirectory())
-            try:
-                unpack(Path(pattern), Path(unpacked))
-            except (OSError, EOFError, ValueError, lzma.LZMAError, tarfile.TarError) as error:
-                raise SettingsError(f"runs must name folders or readable archives, got {pattern}: {error}.") from error
-            pattern = unpacked
-        places.append(pattern)
-    found = []
-    for entry in read_entries(places):
-        if entry.settings and (entry.run.folder / "run.json").exists():
-            try:
-                origin = read_json(entry.run.folder / "run.json")
-            except RunFileError as error:
-                note(f"warning: {entry.run.folder} is left out: {error}")
-                continue
-            found.append(Found(entry, flat(entry.settings), origin if isinstance(origin, dict) else {}))
-    return found
-
-
-class _Bounded:
-    """A compressed file that ends with an error when more comes out of it than any report keeps."""
-
-    def __init__(self, path: Path) -> None:
-        self._file, self._left = lzma.open(path), LARGEST_ARCHIVE  # noqa: SIM115  (it goes with this object)
-
-    def read(self, size: int) -> bytes:
-        """The next bytes."""
-        content = self._file.read(min(size, self._left + 1))
-        self._left -= len(content)
-        if self._left < 0:
-            raise ValueError(f"it holds more than {LARGEST_ARCHIVE:,} bytes")
-        return content
-
-
-def unpack(archive: Path, folder: Path) -> None:
-    """Takes the files that :func:`keep` puts into an archive out of it, and refuses one that holds anything else."""
-    with tarfile.open(fileobj=_Bounded(archive), mode="r|") as members:  # type: ignore[call-overload]
-        for member in members:
-            place = PurePosixPath(member.name)
-            if member.isdir() and not place.is_absolute() and ".." not in place.parts:
-                continue
-            kept = any(
-                place.match(f"*/{pattern}") and len(place.parts) == len(Path(pattern).parts) + 1 for pattern in KEPT
-            )
-            if not member.isreg() or not kept or place.is_absolute() or ".." in place.parts:
-                raise ValueError(f"{member.name} must be a file of a run, such as 000/metrics.csv")
-            (folder / place).parent.mkdir(parents=True, exist_ok=True)
-            content = members.extractfile(member)
-            assert content is not None
-            (folder / place).write_bytes(content.read())
-
-
-def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> tuple[Runs, int]:
-    """The run of each job of an experiment that has one, and the number of jobs that have none.
-
-    Of several runs of one job the finished one that went furthest counts.
-    """
-    found, missing = [], 0
-    for job in jobs_of(experiment if size == "small" else f"paper/{experiment}"):
-        same = [run for run in runs if is_run_of(job, run.settings)]
-        if same:
-            furthest = max(same, key=lambda run: (bool(run.entry.run.summary), run.entry.run.metrics["frames"][-1]))
-            found.append((job, furthest))
-        else:
-            missing += 1
-    return found, missing
 
 
 def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> tuple[str, list[str]]:
@@ -312,12 +222,23 @@ def commits_of(members: list[Found]) -> str:
     return ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
 
 
+def evaluations_of(folder: Path) -> list[dict[str, Any]]:
+    """What evaluate.py wrote into a run folder; a file that can't be read is named in a warning."""
+    found = []
+    for path in sorted((folder / layout.EVALUATIONS).glob("*.json")):
+        try:
+            found.append(read_json(path, root=folder))
+        except (OSError, RunFileError) as error:
+            note(f"warning: {path} is left out: {error}")
+    return found
+
+
 def screen_rows(label: str, members: list[Found]) -> list[str]:
     """What ``evaluations/*.json`` of a group's runs say, as lines of a Markdown table."""
     rows = []
     for member in members:
         run = member.entry.run
-        results = [json.loads(path.read_text()) for path in (run.folder / "evaluations").glob("*.json")]
+        results = evaluations_of(run.folder)
         for result in sorted(results, key=lambda each: (each["env"]["sticky"], each["epsilon"])):
             key = result["per_subgoal"][list(result["env"]["subgoals"]).index("key")]["attained"]
             interval = result["intervals"]["return_mean"]
@@ -345,23 +266,6 @@ def put(text: str, mark: str, part: str) -> str:
     if begin not in text:
         return f"{text.rstrip()}\n\n{marked}\n"
     return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: marked, text, flags=re.DOTALL)
-
-
-def keep(runs: list[Found], archive: Path) -> None:
-    """Writes an archive that this program reads in place of the run folders; the same runs give the same bytes."""
-
-    def undated(member: tarfile.TarInfo) -> tarfile.TarInfo:
-        member.mtime, member.uid, member.gid, member.uname, member.gname = 0, 0, 0, "", ""
-        return member
-
-    archive.parent.mkdir(parents=True, exist_ok=True)
-    partial = archive.with_name(archive.name + ".partial")
-    with tarfile.open(partial, "w:xz") as file:
-        for number, run in enumerate(sorted(runs, key=lambda run: sorted(map(str, run.settings.items())))):
-            folder = run.entry.run.folder
-            for path in sorted(path for pattern in KEPT for path in folder.glob(pattern)):
-                file.add(path, f"{number:03d}/{path.relative_to(folder)}", filter=undated)
-    partial.replace(archive)
 
 
 def main() -> None:

@@ -22,22 +22,14 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from hdrqn_torchrl.cli.configuration import plain
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.commands import command_of
+from hdrqn_torchrl.runs.comparing import BOOKKEEPING, flat
 from hdrqn_torchrl.runs.reading import read_choices, read_config
 from hdrqn_torchrl.runs.settings import RunSettings, Settings, as_plain, check, settings_of
 from hdrqn_torchrl.runs.stored_settings import INTERPOLATION
 
-FREE = (
-    "resume",
-    "resume_override",
-    "checkpoint",
-    "output_root",
-    "allowed_targets",
-    "evaluation.ceilings",
-    "evaluation.ceiling_seconds",
-)
-"""Settings that may differ when a run is resumed: they don't change what is learned."""
 FOLLOWS = "learning_rate_frames"
 """Settings of this name that are equal to ``total_frames`` are raised with it."""
 
@@ -71,7 +63,7 @@ def plan(config: RunSettings, folder: Path) -> Plan:
     refuse_other_algorithm(choices)
     if config.resume is None:
         refuse_reference(folder)
-        if holds_run(folder):
+        if layout.holds_run(folder):
             raise SettingsError(
                 f"{folder} already holds a run, which would be overwritten; "
                 f"`{command(folder, config.allowed_targets)}` goes on, any other hydra.run.dir begins a new one."
@@ -82,7 +74,7 @@ def plan(config: RunSettings, folder: Path) -> Plan:
         if run is None:
             return Plan(folder, config, choices, resumed=False)
     else:
-        run, checkpoint = split(Path(config.resume))
+        run, checkpoint = layout.split(Path(config.resume))
         known = {f"sqlite:///{root}/mlflow.db" for root in (config.output_root, run.parent.parent)}
         config = with_overrides(read_config(run), read_choices(run), config, HydraConfig.get().overrides.task)
         check(config)
@@ -148,27 +140,15 @@ def _is_read_as_it_stands(value: str) -> bool:
         return False
 
 
-def holds_run(folder: Path) -> bool:
-    """Whether a training was begun in a folder."""
-    return (folder / "config.yaml").exists() or (folder / "checkpoints").exists()
-
-
-def split(path: Path) -> tuple[Path, Path | None]:
-    """``resume`` names a run folder or one of its checkpoints."""
-    if path.parent.name == "checkpoints":
-        return path.parent.parent, path
-    return path, None
-
-
 def find_same(config: RunSettings, folder: Path) -> Path | None:
     """The run that the same command started before: in ``folder``, or else the newest below ``output_root``."""
-    if (folder / "config.yaml").exists():
+    if (folder / layout.CONFIG).exists():
         return folder
     if any(override.startswith(("hydra.run", "hydra.sweep")) for override in HydraConfig.get().overrides.hydra):
         return None
     runs = [path.parent for path in Path(config.output_root).glob("*/*/config.yaml")]
     same = [run for run in runs if not _differences_or_broken(run, config)]
-    return max(same, key=lambda run: (run / "config.yaml").stat().st_mtime, default=None)
+    return max(same, key=lambda run: (run / layout.CONFIG).stat().st_mtime, default=None)
 
 
 def _differences_or_broken(run: Path, config: RunSettings) -> list[str]:
@@ -210,8 +190,8 @@ def with_overrides(
 
 def _following(settings: dict[str, Any]) -> list[str]:
     """Full names of the settings that end when the training does."""
-    total = settings["total_frames"]
-    return [key for key, value in _flat(settings["algo"], "algo").items() if key.endswith(FOLLOWS) and value == total]
+    total, found = settings["total_frames"], flat(settings["algo"], path="algo")
+    return [key for key, value in found.items() if key.endswith(FOLLOWS) and value == total]
 
 
 def refuse_differences(run: Path, config: RunSettings) -> None:
@@ -252,13 +232,13 @@ def refuse_going_back(checkpoint: Path) -> None:
 
 def differences(stored: Settings, config: Settings) -> list[str]:
     """Settings that changed, one line each. Raising ``total_frames`` is none, nor is what follows it."""
-    before, after = (_flat(_without_copies(deepcopy(each))) for each in (stored, config))
+    before, after = (flat(_without_copies(deepcopy(each)), without=BOOKKEEPING) for each in (stored, config))
     frames = before.pop("total_frames"), after.pop("total_frames")
     changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
     for key in sorted(before.keys() | after.keys()):
         old, new = before.get(key, "(not set)"), after.get(key, "(not set)")
         follows = key.endswith(FOLLOWS) and (old, new) == frames
-        if old != new and not follows and not {key, key.partition(".")[0]} & set(FREE):
+        if old != new and not follows:
             changed.append(f"{key}: {old} -> {new}")
     return changed
 
@@ -272,20 +252,11 @@ def _without_copies(settings: dict[str, Any]) -> dict[str, Any]:
     return settings
 
 
-def _flat(node: Any, path: str = "") -> dict[str, Any]:
-    if not isinstance(node, dict) or not node:
-        return {path: node}
-    flat: dict[str, Any] = {}
-    for key, item in node.items():
-        flat |= _flat(item, f"{path}.{key}" if path else str(key))
-    return flat
-
-
 def record(run: Plan) -> None:
     """Writes ``config.yaml`` and, at the beginning, ``run.json`` (where the run comes from)."""
     from hdrqn_torchrl.runs.files import write_whole
 
-    if not (run.folder / "run.json").exists():
+    if not (run.folder / layout.ORIGIN).exists():
         origin = {
             "choices": run.choices,
             "overrides": list(HydraConfig.get().overrides.task),
@@ -294,8 +265,8 @@ def record(run: Plan) -> None:
             "commit": _commit(),
             "versions": {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")},
         }
-        write_whole(run.folder / "run.json", json.dumps(origin, indent=2) + "\n")
-    write_whole(run.folder / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(as_plain(run.config))))
+        write_whole(run.folder / layout.ORIGIN, json.dumps(origin, indent=2) + "\n")
+    write_whole(run.folder / layout.CONFIG, OmegaConf.to_yaml(OmegaConf.create(as_plain(run.config))))
 
 
 def _commit() -> str | None:

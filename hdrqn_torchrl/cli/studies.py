@@ -14,9 +14,8 @@ from omegaconf import OmegaConf
 from hdrqn_torchrl.analysis.claims import Alike, Claim, Near, Ordered
 from hdrqn_torchrl.analysis.comparison import GREEDY, PAPER, Panel
 from hdrqn_torchrl.cli.configuration import CONF, plain
-from hdrqn_torchrl.cli.resuming import FREE
+from hdrqn_torchrl.runs.comparing import NOT_LEARNED_FROM, flat
 
-_IRRELEVANT = (*FREE, "logger", "device", "threads", "log_frames")  # to what is learned
 _LEFT_TO_THE_TASK = ("max_target", "max_meta_target", "slice_len")  # null: as the task states its returns and episodes
 ALGORITHMS = (  # the first three are the paper's
     Ordered("return", ["v2", "v1"]),
@@ -174,7 +173,7 @@ class Job:
     overrides: dict[str, str]
     """What the sweep sets, as text."""
     settings: dict[str, Any]
-    """All settings by their full names (:func:`flat`)."""
+    """By their full names, without those that nothing learned depends on."""
 
     def label(self, keys: Iterable[str]) -> str:
         """Values of some of its overrides, names of files of conf/ as they are.
@@ -212,19 +211,8 @@ def jobs_of(experiment: str) -> list[Job]:
             for given in itertools.product(*values):
                 for key, value in given:
                     OmegaConf.update(config, key, parser.parse_override(f"{key}={value}").value(), force_add=True)
-                jobs.append(Job(dict([*chosen, *given]), flat(plain(config))))
+                jobs.append(Job(dict([*chosen, *given]), flat(plain(config), without=NOT_LEARNED_FROM)))
     return jobs
-
-
-def flat(settings: Any, path: str = "") -> dict[str, Any]:
-    """Settings by their full names, without those that do not change what is learned."""
-    if not isinstance(settings, dict) or not settings:
-        return {path: settings}
-    found: dict[str, Any] = {}
-    for key, value in settings.items():
-        if path or key not in _IRRELEVANT:
-            found |= flat(value, f"{path}.{key}" if path else str(key))
-    return found
 
 
 def is_run_of(job: Job, run: dict[str, Any]) -> bool:

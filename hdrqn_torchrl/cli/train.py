@@ -19,7 +19,8 @@ from omegaconf import DictConfig
 
 from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
-from hdrqn_torchrl.cli.resuming import Plan, command, holds_run, plan, record
+from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build, build_algorithm, build_env
 from hdrqn_torchrl.runs.files import check_file, remove, replaced, write_whole
@@ -51,7 +52,7 @@ def main(config: DictConfig) -> float:
         print(f"{str(stop) or 'stopped'}; `{command(folder, config.allowed_targets)}` goes on", file=sys.stderr)
         sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
     except Exception as error:
-        if run is None and not holds_run(folder):
+        if run is None and not layout.holds_run(folder):
             note_error(folder)
         if sweeps.is_sweep() or not isinstance(error, (SettingsError, RunError)):
             raise
@@ -125,7 +126,7 @@ def noting_errors(run: Plan, *, unless: tuple[type[Exception], ...] = ()) -> Ite
 def note_error(folder: Path) -> None:
     """Writes the traceback of the error at hand to ``error.txt``."""
     with contextlib.suppress(OSError):
-        write_whole(folder / "error.txt", traceback.format_exc())
+        write_whole(folder / layout.ERROR, traceback.format_exc())
 
 
 def begin(run: Plan) -> tuple[Trainer, EnvBase, Players]:
@@ -133,12 +134,12 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
 
-    for name in ("config.yaml", "run.json", "metrics.csv", "error.txt", "summary.json", "curves.png"):
+    for name in layout.WRITTEN:
         check_file(run.folder / name)
-    checkpoints = Checkpoints(run.folder / "checkpoints")
+    checkpoints = Checkpoints(run.folder / layout.CHECKPOINTS)
     checkpoints.clean_up()  # first: it may bring back the newest
     start = run.checkpoint or (checkpoints.newest() if run.resumed else None)
-    stale = [*run.folder.glob("*.partial*"), *([run.folder / "metrics.csv"] if start is None else [])]
+    stale = [*run.folder.glob("*.partial*"), *([run.folder / layout.METRICS] if start is None else [])]
     for path in stale:
         remove(path)
     trainer, evaluation_env, players = build_run(run)
@@ -150,7 +151,7 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, Players]:
         trainer.collector.update_policy_weights_()
         run = replace(run, weights=path)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
-    for name in ("error.txt", "summary.json", "curves.png"):
+    for name in layout.AT_THE_END:
         remove(run.folder / name)
     return trainer, evaluation_env, players
 
@@ -173,8 +174,8 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players:
     title = " ".join([*groups, f"seed={run.config.seed}"])
     references = players()  # only now all of them: training need not wait
     summary = folder.write_summary(run.folder, trainer, result, ceiling=trainer.ceiling())
-    with replaced(run.folder / "curves.png") as picture:
-        plot_run(read_metrics(run.folder / "metrics.csv"), picture, title=title, references=references)
+    with replaced(run.folder / layout.CURVES) as picture:
+        plot_run(read_metrics(run.folder / layout.METRICS), picture, title=title, references=references)
     print(json.dumps({"run": str(run.folder), **summary}))
     return summary
 
@@ -244,7 +245,7 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
         log_frames=config.log_frames,
         evaluation_frames=config.evaluation.interval_frames,
         checkpoints=Checkpoints(
-            run.folder / "checkpoints", keep_last=config.checkpoint.keep_last, replay=config.checkpoint.replay
+            run.folder / layout.CHECKPOINTS, keep_last=config.checkpoint.keep_last, replay=config.checkpoint.replay
         ),
         checkpoint_frames=config.checkpoint.interval_frames,
         checkpoint_seconds=60.0 * config.checkpoint.interval_minutes,

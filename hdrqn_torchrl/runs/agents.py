@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.envs.specs import interface_differences
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError, shown
 from hdrqn_torchrl.runs.building import build_algorithm, build_env
 from hdrqn_torchrl.runs.reading import read_config
@@ -67,7 +68,7 @@ def load_agent(
     config = replace(own, env=own.env | changes)
     env, algorithm = build_algorithm(config, {"num_envs": num_envs, "device": "cpu"}, allowed_targets)
     try:
-        load_policy(algorithm.policy, folder / "checkpoints", checkpoint)
+        load_policy(algorithm.policy, folder / layout.CHECKPOINTS, checkpoint)
     except ValueError as error:
         if changes:
             refuse_other_interface(build_env(own, {"num_envs": 1, "device": "cpu"}, allowed_targets), env, changes)

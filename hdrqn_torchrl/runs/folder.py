@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.files import write_whole
 from hdrqn_torchrl.runs.locking import InUse, lock
 from hdrqn_torchrl.runs.trainer import Trainer
@@ -34,7 +35,7 @@ def write_summary(
         "wall_seconds": round(trainer.wall_seconds, 1),
         "ceiling": ceiling,
     }
-    write_whole(folder / "summary.json", json.dumps(summary, indent=2) + "\n")
+    write_whole(folder / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")
     return summary
 
 
@@ -58,7 +59,7 @@ def locked(folder: Path, *, patience_seconds: float = 0.0, tell: Callable[[str],
     with ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            stack.enter_context(lock(folder / ".lock", patience_seconds=patience_seconds, tell=tell_of))
+            stack.enter_context(lock(folder / layout.LOCK, patience_seconds=patience_seconds, tell=tell_of))
         except InUse as error:
             raise ValueError(f"{folder} is in use: {error.owner} is training there; wait or stop it.") from error
         except OSError as error:

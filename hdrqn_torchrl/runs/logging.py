@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torchrl.record.loggers.common import Logger
 
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.files import open_file, read_bytes, read_text, replaced
 from hdrqn_torchrl.runs.services import make_mlflow_logger, make_tensorboard_logger, make_wandb_logger
 
@@ -117,7 +118,7 @@ class RunLogger:
         label: str = "",
     ) -> None:
         self.label = f"{label}  " if label else ""
-        self.csv, self.loggers = CSVLog(folder / "metrics.csv"), loggers or []
+        self.csv, self.loggers = CSVLog(folder / layout.METRICS), loggers or []
         self.console = console or Console(file=sys.stderr)
         self._progress = Progress(
             TextColumn("{task.percentage:>3.0f}%"),

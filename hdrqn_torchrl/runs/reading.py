@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.files import RunFileError, read_json
 from hdrqn_torchrl.runs.settings import RunSettings, settings_of
@@ -16,7 +17,7 @@ def read_config(folder: Path) -> RunSettings:
     Raises:
         SettingsError: if there is none, or it can't be the settings of a run.
     """
-    path = folder / "config.yaml"
+    path = folder / layout.CONFIG
     if not path.is_file():
         raise SettingsError(
             f"run must be the folder of a training, got {folder}, which has no config.yaml; "
@@ -33,7 +34,7 @@ def read_config(folder: Path) -> RunSettings:
 def read_choices(folder: Path) -> dict[str, str]:
     """Which file of each group of conf/ a run was composed of (``{"env": "gridworld", "algo": "v2", ...}``)."""
     try:
-        choices = read_json(folder / "run.json")["choices"]
+        choices = read_json(folder / layout.ORIGIN)["choices"]
         return {str(group): str(choice) for group, choice in choices.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}  # it is for headings and comparisons only

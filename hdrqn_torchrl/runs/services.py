@@ -16,6 +16,8 @@ from typing import Any
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
+from hdrqn_torchrl.runs import layout
+from hdrqn_torchrl.runs.comparing import flat
 from hdrqn_torchrl.runs.files import check_folder, read_json, write_whole
 from hdrqn_torchrl.runs.locking import lock
 
@@ -35,8 +37,8 @@ class RewindingTensorboardLogger(TensorboardLogger):
 
 def make_tensorboard_logger(folder: Path) -> Logger:
     """TorchRL's TensorBoard logger, writing to ``folder/tensorboard``."""
-    check_folder(folder / "tensorboard", root=folder)
-    return RewindingTensorboardLogger("tensorboard", log_dir=str(folder))
+    check_folder(folder / layout.TENSORBOARD, root=folder)
+    return RewindingTensorboardLogger(layout.TENSORBOARD, log_dir=str(folder))
 
 
 def make_wandb_logger(
@@ -119,7 +121,7 @@ def make_mlflow_logger(
     if run_id is None:
         _record(record, logger.experiment.info.run_id)
         mlflow.set_tag("mlflow.runName", _name(folder))
-        logger.log_hparams(_flat(settings or {}))
+        logger.log_hparams(flat(settings) if settings else {})
     else:
         logger.logged_until = logger.experiment.data.metrics.get("frames", -1)
     return logger
@@ -164,11 +166,3 @@ def _recorded(path: Path) -> str | None:
 
 def _record(path: Path, run_id: str) -> None:
     write_whole(path, json.dumps({"id": run_id}) + "\n")
-
-
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings under their full names, as MLflow wants its parameters."""
-    flat: dict[str, Any] = {}
-    for name, value in settings.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return flat

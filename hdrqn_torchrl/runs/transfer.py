@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.weights import read_weights
 
@@ -31,9 +32,9 @@ def find_weights(place: Path, which: str = "best") -> Path:
         ValueError: if there is none.
     """
     try:
-        if place.is_file() or place.parent.name == "checkpoints":
+        if place.is_file() or layout.is_checkpoint(place):
             return place
-        checkpoints = Checkpoints(place / "checkpoints")
+        checkpoints = Checkpoints(place / layout.CHECKPOINTS)
         path = checkpoints.best() if which == "best" else checkpoints.newest()
     except (CheckpointError, OSError) as error:
         raise ValueError(f"init_from can't be read: {error}") from error

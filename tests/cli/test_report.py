@@ -9,9 +9,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from hdrqn_torchrl.analysis.claims import Near
-from hdrqn_torchrl.cli import report
+from hdrqn_torchrl.cli import findings, report
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.cli.studies import CONF, STUDIES, Job, flat, is_run_of, jobs_of
+from hdrqn_torchrl.cli.configuration import CONF
+from hdrqn_torchrl.cli.studies import STUDIES, Job, is_run_of, jobs_of
+from hdrqn_torchrl.runs.comparing import NOT_LEARNED_FROM, flat
 
 COLUMNS = (
     "frames,episodes,updates,wall_seconds,behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/steps"
@@ -231,7 +233,8 @@ class TestStudies:
         assert len(tried["v2"]) == 4
 
     def test_what_runs_have_in_common(self):
-        settings = flat({"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None})
+        found = {"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None}
+        settings = flat(found, without=NOT_LEARNED_FROM)
         assert settings == {"seed": 0, "algo.gamma": 0.9, "algo.tau": 0.1}
         job = Job({}, settings)
         assert is_run_of(job, settings)
@@ -243,9 +246,9 @@ class TestStudies:
 def test_the_kept_runs_are_still_those_of_their_study():
     """Settings that were renamed or left to the task since they were made must not make strangers of them."""
     with ExitStack() as stack:
-        kept = report.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
-        found, missing = report.runs_of_jobs("gridworld", "small", kept)
-        of_authors, _ = report.runs_of_jobs("authors_choices", "small", kept)
+        kept = findings.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
+        found, missing = findings.runs_of_jobs("gridworld", "small", kept)
+        of_authors, _ = findings.runs_of_jobs("authors_choices", "small", kept)
     assert (len(found), missing) == (18, 0)
     assert len({run.entry.run.folder for _, run in found}) == 18
     assert len(of_authors) > 0
