@@ -1,5 +1,6 @@
 """Environments, the scripted players that mark their ceilings, and their Gymnasium twins."""
 
+from hdrqn_torchrl.envs.check import Finding, check_task
 from hdrqn_torchrl.envs.grid.ceilings import ceiling
 from hdrqn_torchrl.envs.grid.environment import MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid.scripted import (
@@ -16,6 +17,7 @@ from hdrqn_torchrl.envs.task import Reference, SubgoalSet, Task, task_of
 
 __all__ = [
     "EgocentricSearch",
+    "Finding",
     "FullInformationPlanner",
     "MontezumaEnv",
     "MultiGoalGridEnv",
@@ -25,6 +27,7 @@ __all__ = [
     "Task",
     "UniformRandom",
     "ceiling",
+    "check_task",
     "make_montezuma",
     "play_episodes",
     "scripted_ceiling",

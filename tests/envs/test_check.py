@@ -1,0 +1,184 @@
+"""Environments with one fault each are told of it; the project's own have none."""
+
+import re
+
+import pytest
+import torch
+from helpers import small_env
+from torchrl.data import Binary, Unbounded
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
+from user_envs import Corridor
+
+from hdrqn_torchrl.envs import MultiGoalGridEnv, SubgoalSet, Task, check_task
+
+WHOLE = Task(
+    max_steps=6,
+    largest_return=6.0,
+    largest_extrinsic_return=6.0,
+    smallest_extrinsic_return=0.0,
+    subgoals=(SubgoalSet(names=("left", "right"), repeatable=True),),
+    actions=("left", "right"),
+)
+
+
+def corridor(cls=Corridor, *, task=WHOLE, **settings):
+    return cls(4, task=task, without=(), **settings)
+
+
+def wrong(env):
+    return [finding.what for finding in check_task(env, steps=60) if finding.severity == "wrong"]
+
+
+def missing(env):
+    return {finding.costs for finding in check_task(env, steps=60) if finding.severity == "missing"}
+
+
+class Standing(Corridor):
+    """Attains an end in every step that it stands there."""
+
+    def _written(self, moved, *specs):
+        return super()._written(torch.ones_like(moved), *specs)
+
+
+class Endless(Corridor):
+    """Its episodes are longer than it says."""
+
+    def _step(self, tensordict):
+        after = super()._step(tensordict)
+        return after.update({key: torch.zeros_like(after[key]) for key in ("done", "truncated")})
+
+
+class Careless(Corridor):
+    """``done`` without a reason."""
+
+    def _step(self, tensordict):
+        after = super()._step(tensordict)
+        return after.set("truncated", torch.zeros_like(after["done"]))
+
+
+class Shapeless(Corridor):
+    def _step(self, tensordict):
+        after = super()._step(tensordict)
+        return after.set("reward", after["reward"].double())
+
+
+class Forgetful(Corridor):
+    """Does not store where it is."""
+
+    def state_dict(self, *args, **kwargs):
+        return {"steps": self._steps}
+
+    def load_state_dict(self, state_dict, strict=True):
+        self._steps = state_dict["steps"]
+
+
+class Stateless(Corridor):
+    def state_dict(self, *args, **kwargs):
+        return {}
+
+
+class Random(Corridor):
+    """Starts anywhere, whatever the seed."""
+
+    def _reset(self, tensordict, **kwargs):
+        super()._reset(tensordict, **kwargs)
+        self._place = torch.randint(1, 4, self.batch_size, generator=self.generator())
+        return self._written(
+            torch.zeros_like(self._place, dtype=torch.bool), self.observation_spec, self.full_done_spec
+        )
+
+    def generator(self):
+        if not hasattr(self, "_generator"):
+            self._generator = torch.Generator().manual_seed(0)
+        return self._generator
+
+
+class Deaf(Random):
+    """Begins with the same seed every time."""
+
+    def _set_seed(self, seed):
+        self.generator().manual_seed(0)
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        MultiGoalGridEnv(4, seed=0),
+        MultiGoalGridEnv(4, layout="four_rooms", num_goals=3, obstacle="teleport", places=True),
+        MultiGoalGridEnv(4, layout="nine_rooms", max_steps=150),
+        small_env(4, max_steps=9),
+    ],
+    ids=["open", "four_rooms", "nine_rooms", "small"],
+)
+def test_the_grids_have_no_faults_and_no_gaps(env):
+    assert check_task(env, steps=120) == []
+
+
+def test_a_whole_task_without_players_and_picture_does_without_a_ceiling_line():
+    assert wrong(corridor()) == []
+    assert missing(corridor()) == {"no ceiling line", "watch.py shows observations as numbers"}
+
+
+@pytest.mark.parametrize(
+    "env, fault",
+    [
+        (corridor(Standing), "'attained' must be true only in the step that attains a subgoal"),
+        (corridor(task=Task(subgoals=(SubgoalSet(names=("a", "b")),))), "'attained' must be true once in an episode"),
+        (corridor(task=Task(subgoals=(SubgoalSet(names=("a",)),))), r"'attained' must be torch.bool \[4, 1\]"),
+        (corridor(task=Task(subgoals=(SubgoalSet(names=("a",), prefix="near"),))), "'near_attained' is missing"),
+        (corridor(odd={"attained": Unbounded((4, 2))}), r"'attained' must be torch.bool \[4, 2\], got torch.float32"),
+        (corridor(odd={"hazard": Binary(shape=(4,), dtype=torch.bool)}), r"'hazard' must be torch.bool \[4, 1\]"),
+        (corridor(Endless), "an episode went on after max_steps=6"),
+        (corridor(Careless), "'done' must be 'terminated' or 'truncated'"),
+        (corridor(Shapeless), "'reward' must be torch.float32 .* as its spec says, got torch.float64"),
+        (corridor(pays=10.0), r"the sum of 'reward' must lie in \[-inf, 6\]"),
+        (corridor(pays=float("nan")), "'reward' must be finite"),
+        (corridor(pays=-1.0), r"the sum of 'extrinsic_reward' must lie in \[0, 6\]"),
+        (corridor(Random), "the same seed must give the same worlds"),
+        (corridor(Deaf), "another seed must give other worlds"),
+        (corridor(Forgetful), r"state_dict\(\) must hold all there is"),
+        (Corridor(None, task=WHOLE), r"the batch size must be \[N\]"),
+        (corridor(odd={"action": Unbounded((4, 1))}), "'action' must be one number"),
+    ],
+    ids=lambda each: each if isinstance(each, str) else "",
+)
+def test_a_fault_is_found_and_named(env, fault):
+    found = wrong(env)
+    assert any(re.match(fault, each) for each in found), found
+
+
+@pytest.mark.parametrize(
+    "env, costs",
+    [
+        (corridor(Stateless), "no resume: a training that was stopped begins anew"),
+        (Corridor(4, task=WHOLE), "no success rate"),
+        (Corridor(4, task=WHOLE), "no penalty for what is to be avoided"),
+        (Corridor(4, without=("attained", "hazard", "success")), "agents of one level only"),
+        (Corridor(4, task=WHOLE, without=("extrinsic_reward",)), "agents of one level only"),
+        (Corridor(4), "targets are not bounded"),
+        (Corridor(4), "evaluations need max_steps, v3 needs slice_len"),
+        (Corridor(4), "they have no names, and there is no third level"),
+        (Corridor(4), "watch.py numbers them"),
+    ],
+)
+def test_a_gap_is_named_with_what_it_costs(env, costs):
+    assert costs in missing(env)
+
+
+def test_environments_are_checked_through_transforms_and_batches():
+    assert wrong(TransformedEnv(corridor(), StepCounter(max_steps=4))) == []
+    assert not [each for each in wrong(SerialEnv(3, lambda: Corridor(None, without=(), task=WHOLE))) if "seed" in each]
+
+
+def test_random_numbers_go_on_as_if_nothing_had_been_checked():
+    env = MultiGoalGridEnv(2, seed=0)
+    before = torch.get_rng_state()
+    check_task(env, steps=5)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_a_finding_reads_as_a_sentence():
+    finding = next(each for each in check_task(corridor(), steps=5) if "players" in each.what)
+    assert str(finding) == "missing: there are no scripted players (no ceiling line)"
+    with pytest.raises(ValueError, match="steps must be >= 1, got 0"):
+        check_task(corridor(), steps=0)
