@@ -6,12 +6,17 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from processes import ROOT
 from programs import TINY_HDRQN
+from user_envs import Pictured
 
-from hdrqn_torchrl.cli import evaluate, plot
+from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
+from hdrqn_torchrl.cli import evaluate, plot, watch
 from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.modules import compact_network
+from hdrqn_torchrl.rendering import draw_frame, record_episodes
 
 TRUSTED = "allowed_targets=[user_envs.Corridor]"
 TASK = [
@@ -59,6 +64,24 @@ def test_it_is_evaluated_and_plotted_with_what_there_is(run, tmp_path, monkeypat
     for kind in ("curves", "greedy", "bars"):
         call(plot, monkeypatch, f"runs={run}", f"out={tmp_path / kind}.png", f"kind={kind}")
         assert (tmp_path / f"{kind}.png").stat().st_size > 1000
+
+
+def test_it_is_watched_in_numbers_and_episodes_without_end_are_cut_off(run, tmp_path, monkeypatch, capsys):
+    call(watch, monkeypatch, f"run={run}", f"out={tmp_path}/episode.gif", "episodes=1", TRUSTED)
+    told = capsys.readouterr().out
+    assert "episode 1: time is up" in told and "20 steps" in told and (tmp_path / "episode.gif").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("algorithm", ["v1", "v2", "v3"])
+def test_subgoals_that_can_be_attained_again_stay_and_what_is_rendered_is_watched(algorithm, tmp_path):
+    env = Pictured(1)
+    network = compact_network(8, (8,))
+    agent = make_v3(env, network) if algorithm == "v3" else make_hdrqn(env, network, version=algorithm)
+    steps = agent.transform(env).rollout(6, agent.policy)
+    assert steps["subgoal_mask"].all()
+    frames = record_episodes(agent.transform(Pictured(1)), agent)
+    assert len(frames) == 7 and frames[0].scene.subgoal_names == ("west", "east")
+    assert isinstance(frames[0].scene.rendered, np.ndarray) and draw_frame(frames[0]).shape[1] > 100
 
 
 def test_what_an_agent_needs_is_said_before_anything_is_trained(tmp_path):

@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from hdrqn_torchrl.envs import Task
+from hdrqn_torchrl.envs import SubgoalSet, Task
 
 CELLS = 5
 
@@ -112,6 +112,21 @@ class Corridor(EnvBase):
         wanted = {key: spec for each in specs for key, spec in each.items()}
         outcome = {key: spec.rand() if key in self.odd else values[key] for key, spec in wanted.items()}
         return TensorDict(outcome, self.batch_size)
+
+
+class Pictured(Corridor):
+    """The corridor with a picture of its own, and ends that are known to be attained again and again."""
+
+    def __init__(self, num_envs: int | None = 4, **settings) -> None:
+        ends = SubgoalSet(names=("west", "east"), repeatable=True)
+        super().__init__(num_envs, task=Task(subgoals=(ends,), actions=("go west", "go east")), **settings)
+
+    def render(self):
+        """One red column where the first agent is, ``[4, 10, 3]``."""
+        picture = np.full((4, 2 * CELLS, 3), 255, np.uint8)
+        place = int(self._place.view(-1)[0])
+        picture[:, 2 * place : 2 * place + 2] = (255, 0, 0)
+        return picture
 
 
 class Walk(gymnasium.Env):

@@ -83,7 +83,12 @@ def record(settings: Settings) -> list[Frame]:
         allowed_targets=settings.allowed_targets,
     )
     return record_episodes(
-        agent.env, agent.algorithm, episodes=settings.episodes, seed=settings.seed, epsilon=settings.epsilon
+        agent.env,
+        agent.algorithm,
+        episodes=settings.episodes,
+        seed=settings.seed,
+        epsilon=settings.epsilon,
+        max_steps=agent.config.evaluation.max_steps,
     )
 
 

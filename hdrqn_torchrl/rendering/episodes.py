@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
@@ -16,12 +16,19 @@ from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.modules import EpsilonGreedy, writing_values
 from hdrqn_torchrl.rendering.frames import Decision, Frame, Pursuit, Score
 from hdrqn_torchrl.rendering.scenes import scene_of, subgoal_names
+from hdrqn_torchrl.runs.evaluation import LONGEST_EPISODE
 from hdrqn_torchrl.runs.isolation import isolated
 
 
 @torch.no_grad()
 def record_episodes(
-    env: EnvBase, algorithm: Algorithm, *, episodes: int = 1, seed: int = 0, epsilon: float = 0.0
+    env: EnvBase,
+    algorithm: Algorithm,
+    *,
+    episodes: int = 1,
+    seed: int = 0,
+    epsilon: float = 0.0,
+    max_steps: int | None = None,
 ) -> list[Frame]:
     """Plays episodes one after another in one world. The same seed gives the same frames.
 
@@ -31,6 +38,7 @@ def record_episodes(
         episodes: number of episodes, at least 1.
         seed: seed of worlds and exploration.
         epsilon: probability of a random choice, at every level.
+        max_steps: steps after which an episode is cut off; ``None``: as many as the task says, or 10,000.
 
     Returns:
         One frame for each step and one more for the end of each episode.
@@ -62,19 +70,20 @@ def record_episodes(
         _fixed_epsilon(algorithm.explorations, epsilon),
         writing_values(algorithm.policy),
     ):
-        rounds = (_play(env, algorithm, number + 1, episodes) for number in range(episodes))
+        rounds = (_play(env, algorithm, number + 1, episodes, max_steps) for number in range(episodes))
         return [frame for played in rounds for frame in played]
 
 
-def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> Iterator[Frame]:
+def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int, max_steps: int | None) -> Iterator[Frame]:
     """The frames of one episode."""
     base, tensordict = getattr(env, "base_env", env), env.reset()
-    max_steps, draws_subgoals = task_of(env).max_steps, _draws_subgoals(base, algorithm)
+    task, draws_subgoals = task_of(env), _draws_subgoals(base, algorithm)
+    longest = max_steps or task.max_steps or LONGEST_EPISODE
     own, *above = algorithm.levels
     score = Score((False,) * len(_attained(tensordict[0])), intrinsic=None if own.reward_key is None else 0.0)
     pursuits: tuple[Pursuit, ...] = ()
     event = ""
-    while True:
+    for step in range(longest):
         algorithm.policy(tensordict)
         now = tensordict[0]
         pursuits = _pursue(above, now, pursuits)
@@ -90,7 +99,7 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> It
             ),
             episode=episode,
             episodes=episodes,
-            max_steps=max_steps,
+            max_steps=task.max_steps,
             score=score,
             action=action,
             pursuits=pursuits,
@@ -101,9 +110,10 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int) -> It
         after = tensordict["next"][0]
         pursuits = tuple(replace(pursuit, steps=pursuit.steps + 1) for pursuit in pursuits)
         score, event = _add(score, own, after), _tell(frame, above, after)
-        if after[keys.DONE]:
+        if after[keys.DONE] or step + 1 == longest:
+            frame = replace(frame, score=score, event=event, pursuits=pursuits, success=_happened(after, task.success))
             subgoal = pursuits[-1].decision.choice if draws_subgoals else None
-            yield _last(replace(frame, score=score, event=event, pursuits=pursuits), base, subgoal, after)
+            yield _last(frame, base, subgoal, after)
             return
         tensordict = env.step_mdp(tensordict)
 
@@ -125,12 +135,10 @@ def _decision(view: LevelView, now: TensorDictBase) -> Decision:
 
 def _last(frame: Frame, base: EnvBase, subgoal: int | None, after: TensorDictBase) -> Frame:
     """The end of an episode: the world after the last step."""
-    success = _happened(after, keys.SUCCESS)
     return replace(
         frame,
         scene=scene_of(base, subgoal=subgoal, observation=after.get(keys.OBSERVATION, None)),
-        outcome=frame.scene.outcome(success, bool(after[keys.TERMINATED])),
-        success=success,
+        outcome=frame.scene.outcome(frame.success, bool(after[keys.TERMINATED])),
     )
 
 
@@ -181,7 +189,7 @@ def _extrinsic_reward(after: TensorDictBase) -> float:
     return after[keys.EXTRINSIC_REWARD if keys.EXTRINSIC_REWARD in after else keys.REWARD].item()
 
 
-def _happened(after: TensorDictBase, key: str) -> bool:
+def _happened(after: TensorDictBase, key: NestedKey) -> bool:
     """Whether a flag is set that not every environment has."""
     return key in after and bool(after[key])
 

@@ -3,7 +3,7 @@ import pytest
 import torch
 from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT, small_env
 from torchrl.envs import GymEnv
-from user_envs import Corridor
+from user_envs import Corridor, Pictured
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid.cells import palette
@@ -137,3 +137,10 @@ def test_an_environment_that_renders_nothing_is_shown_in_numbers():
     assert len(np.unique(pixels(scene.draw_world(120)).reshape(-1, 3), axis=0)) > 1
     assert scene.subgoal_names == ("subgoal 0", "subgoal 1")
     assert scene_of(Corridor(1)).write_view().plain == "no picture"
+
+
+def test_what_an_environment_renders_is_its_world():
+    scene = scene_of(Pictured(1))
+    picture = pixels(scene.draw_world(100))
+    assert picture.shape == (40, 100, 3) and (picture[0, 45] == [255, 0, 0]).all() and (picture[0, 5] == 255).all()
+    assert scene.subgoal_names == ("west", "east") and scene.action_names == ("go west", "go east")

@@ -8,9 +8,11 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 
 pytest.importorskip("ale_py")
 
+from hdrqn_torchrl.envs import check_task, task_of
 from hdrqn_torchrl.envs.montezuma.environment import ALL_ACTIONS, USEFUL_ACTIONS, MontezumaEnv
 from hdrqn_torchrl.envs.montezuma.making import make_montezuma
 from hdrqn_torchrl.envs.montezuma.screen import BOXES, SUBGOALS, locate
+from hdrqn_torchrl.rendering import scene_of
 
 ROUTE = json.loads((Path(__file__).parent / "montezuma_route.json").read_text())
 """Actions that take the key and open the right door, and what happens at which step."""
@@ -86,12 +88,32 @@ class TestRoute:
         assert x.min() >= 11 and x.max() <= 148 and y.min() >= 65 and y.max() <= 170
 
 
+def test_key_and_door_are_a_farther_set_of_subgoals_on_request():
+    env, plain = (MontezumaEnv(1, seed=0, key_and_door=wanted) for wanted in (True, False))
+    steps, usual = (play(each, ROUTE["actions"]) for each in (env, plain))
+    near, far = task_of(env).subgoals
+    assert (near.names, near.prefix, far.names, far.prefix) == (SUBGOALS, "places", ("key", "door"), "")
+    assert [each.names for each in task_of(plain).subgoals] == [SUBGOALS]
+    assert [steps["attained"][:, g].nonzero().flatten().tolist() for g in range(2)] == [[75], [166]]
+    assert steps["available"][:75].all() and steps["available"][75:].tolist() == [[False, True]] * 92
+    for entry in ("attained", "available"):
+        assert (steps[f"places_{entry}"] == usual[entry]).all()
+    assert scene_of(env, subgoal=1).subgoal_names == ("key", "door")
+    check_env_specs(env)
+
+
 def test_the_screen_shows_the_agent_where_the_ram_says():
     by_ram, by_pixels = (MontezumaEnv(1, locator=locator, seed=0) for locator in ("ram", "pixels"))
     a, b = play(by_ram, ROUTE["actions"]), play(by_pixels, ROUTE["actions"])
     assert (a["position"] - b["position"]).abs().mean() < 1.0
     assert (a["position"] - b["position"]).abs().max() <= 9.0
     assert (a["attained"] == b["attained"]).float().mean() > 0.98
+
+
+@pytest.mark.parametrize("settings", [{}, {"key_and_door": True, "noops": 30, "practice": 0.5}], ids=str)
+def test_it_keeps_the_contract_of_tasks_and_has_no_scripted_players(settings):
+    found = check_task(make_montezuma(2, max_steps=40, **settings), steps=60)
+    assert [finding.costs for finding in found] == ["no ceiling line"]
 
 
 def test_without_an_agent_the_locator_takes_the_middle():
