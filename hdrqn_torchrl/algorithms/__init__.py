@@ -8,7 +8,8 @@ from hdrqn_torchrl.algorithms.base import Algorithm, make_recurrent_loss
 from hdrqn_torchrl.algorithms.flat import make_dqn, make_drqn
 from hdrqn_torchrl.algorithms.hierarchical import make_hdqn, make_hdrqn
 from hdrqn_torchrl.algorithms.levels import Level
-from hdrqn_torchrl.algorithms.v3 import V3_LEARNER, make_v3
+from hdrqn_torchrl.algorithms.presets import V3_LEARNER
+from hdrqn_torchrl.algorithms.v3 import make_v3
 from hdrqn_torchrl.algorithms.views import LevelView
 
 __all__ = [

@@ -8,6 +8,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms import presets
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.algorithms.views import views_of
@@ -20,7 +21,7 @@ def make_drqn(
     env: EnvBase,
     architecture: Architecture,
     *,
-    learner: LearnerSettings = LearnerSettings(),  # noqa: B008 (frozen)
+    learner: LearnerSettings = presets.DRQN_LEARNER,
     exploration: EpsilonGreedy | None = None,
     gamma: float = 0.99,
     recurrent: bool = True,
@@ -34,7 +35,7 @@ def make_drqn(
             and ``reward``.
         architecture: networks.
         learner: how it learns.
-        exploration: its schedule.
+        exploration: its schedule; ``None``: that of :mod:`~hdrqn_torchrl.algorithms.presets`.
         gamma: discount of one step.
         recurrent: ``False`` gives DQN.
         prediction_steps, prediction_weight: as in :func:`make_v3`.
@@ -48,7 +49,7 @@ def make_drqn(
         >>> list(make_drqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['flat']
     """
-    exploration = exploration or EpsilonGreedy()
+    exploration = exploration or presets.flat_exploration()
     has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", levels=1)
     network = architecture.q_network(
         has.observation, num_actions=has.num_actions, recurrent=recurrent, prediction_steps=prediction_steps
@@ -82,5 +83,5 @@ def make_drqn(
     )
 
 
-make_dqn = partial(make_drqn, recurrent=False)
+make_dqn = partial(make_drqn, recurrent=False, learner=presets.DQN_LEARNER)
 """Flat Q-learning without memory (Mnih et al., 2015); see :func:`make_drqn`."""

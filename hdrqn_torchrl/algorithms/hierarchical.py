@@ -10,6 +10,7 @@ from typing import Literal
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
+from hdrqn_torchrl.algorithms import presets
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of
 from hdrqn_torchrl.algorithms.books import make_books
 from hdrqn_torchrl.algorithms.hdrqn_levels import LevelBuilder
@@ -26,8 +27,8 @@ def make_hdrqn(
     *,
     version: Literal["v1", "v2"] = "v2",
     levels: int = 2,
-    sub: LearnerSettings = LearnerSettings(),  # noqa: B008
-    meta: LearnerSettings = LearnerSettings(slice_len=1, capacity=50_000),  # noqa: B008
+    sub: LearnerSettings = presets.SUB_LEARNER,
+    meta: LearnerSettings | None = None,
     middle: LearnerSettings | None = None,
     sub_exploration: EpsilonGreedy | None = None,
     meta_exploration: EpsilonGreedy | None = None,
@@ -62,9 +63,11 @@ def make_hdrqn(
         architecture: networks.
         version: what levels that choose subgoals read: ``"v1"`` the observation, ``"v2"`` the state of the level below.
         levels: L; the agent pursues the farthest L - 1 sets of subgoals of the task.
-        sub, meta, middle: how each level learns; ``middle=None``: like ``meta``.
-        sub_exploration, meta_exploration, middle_exploration: their schedules; ``middle_exploration=None``: a copy of
-            the meta level's. Each middle level has a copy of its own.
+        sub, meta, middle: how each level learns; ``meta=None``: :data:`~hdrqn_torchrl.algorithms.presets.META_LEARNER`,
+            for v1 with sequences of two options; ``middle=None``: like ``meta``.
+        sub_exploration, meta_exploration, middle_exploration: their schedules; ``None``: those of
+            :mod:`~hdrqn_torchrl.algorithms.presets`, and for middle levels the meta level's. Each middle level has a
+            copy of its own.
         phase_one: how long the meta level's subgoals are chosen at random and it does not learn; ``None``: all levels
             learn from the start.
         gamma: discount of one step.
@@ -102,6 +105,7 @@ def make_hdrqn(
         ['sub', 'meta']
     """
     _check_version(version, recurrent, meta_input, meta_input_time)
+    meta = meta or presets.meta_learner(version)
     _check_levels(levels, meta_hindsight, meta_input_time)
     _check_hindsight(sub, meta, sub_hindsight, meta_hindsight)
     has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", levels=levels)
@@ -125,7 +129,8 @@ def make_hdrqn(
         prediction_steps=prediction_steps,
         prediction_weight=prediction_weight,
     )
-    sub_exploration, meta_exploration = sub_exploration or EpsilonGreedy(), meta_exploration or EpsilonGreedy()
+    sub_exploration = sub_exploration or presets.sub_exploration()
+    meta_exploration = meta_exploration or presets.meta_exploration()
     middles = [deepcopy(middle_exploration or meta_exploration) for _ in has.levels[1:-1]]
     sub_controller = build.sub_controller(sub_exploration)
     uppers = [
@@ -163,7 +168,7 @@ def make_hdrqn(
     )
 
 
-make_hdqn = partial(make_hdrqn, version="v1", recurrent=False)
+make_hdqn = partial(make_hdrqn, version="v1", recurrent=False, sub=presets.HDQN_SUB_LEARNER, meta=presets.META_LEARNER)
 """Levels without memory (h-DQN; Kulkarni et al., 2016); see :func:`make_hdrqn`."""
 
 

@@ -14,6 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms import presets
 from hdrqn_torchrl.algorithms.base import (
     Algorithm,
     copies_of,
@@ -32,23 +33,11 @@ from hdrqn_torchrl.modules import (
     AllSubgoalsPolicy,
     Architecture,
     EpsilonGreedy,
-    RepeatingEpsilonGreedy,
     observation_predictor,
 )
 from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
 
-V3_LEARNER = LearnerSettings(
-    slice_len=None,
-    capacity=200_000,
-    frames_per_update=20,
-    warmup_frames=10_000,
-    learning_rate=6e-4,
-    tau=0.005,
-    max_grad_norm=10.0,
-    sampling="episode_starts",
-)
-"""Defaults of :func:`make_v3`."""
 LONGEST_SEQUENCE = 200
 """Longest episode, in steps, that v3 replays as a whole by default."""
 SHORT_SEQUENCE = 32
@@ -60,7 +49,7 @@ def make_v3(
     architecture: Architecture,
     *,
     levels: int = 2,
-    learner: LearnerSettings = V3_LEARNER,
+    learner: LearnerSettings = presets.V3_LEARNER,
     sub_exploration: EpsilonGreedy | None = None,
     meta_exploration: EpsilonGreedy | None = None,
     middle_exploration: EpsilonGreedy | None = None,
@@ -69,8 +58,8 @@ def make_v3(
     head_size: int = 128,
     joint: bool = True,
     meta_learning_rate: float | None = None,
-    sub_gamma: float = 0.95,
-    meta_gamma: float = 0.97,
+    sub_gamma: float = 0.9,
+    meta_gamma: float = 0.95,
     middle_gamma: float | None = None,
     trace_decay: float = 0.8,
     all_subgoals: bool = True,
@@ -98,7 +87,8 @@ def make_v3(
             anywhere. ``slice_len=None``: the longest episode that the task states, up to 200 steps; if episodes may be
             longer or the task does not say, ``"episode_starts"`` is replaced by sequences of 32 steps from anywhere
             (``sampling="steps"``, ``stored_state=True``, ``burn_in=0.25``).
-        sub_exploration, meta_exploration: exploration schedules; the default sub level repeats random actions.
+        sub_exploration, meta_exploration: exploration schedules; ``None``: those of
+            :mod:`~hdrqn_torchrl.algorithms.presets`, where the sub level repeats random actions.
         middle_exploration: schedule of the levels in between, copied for each; ``None``: that of the meta level.
         phase_one: how long subgoals are chosen at random (the meta level learns meanwhile, because its head learns from
             every step); ``None``: never.
@@ -140,7 +130,8 @@ def make_v3(
         )
     has = check_environment(env, architecture, builder="make_v3", levels=levels)
     learner = _with_sequences(learner, has.task)
-    sub_exploration, meta_exploration = sub_exploration or RepeatingEpsilonGreedy(), meta_exploration or EpsilonGreedy()
+    sub_exploration = sub_exploration or presets.v3_sub_exploration()
+    meta_exploration = meta_exploration or presets.meta_exploration()
     policy = AllSubgoalsPolicy(
         _make_network(has, architecture, memory_size, head_size, joint, prediction_steps),
         sub_exploration,

@@ -12,7 +12,10 @@ from hdrqn_torchrl.objectives import check_returns, target_lookahead
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerSettings:
-    """How one level learns. The defaults are the paper's where it states them.
+    """How one level learns. The defaults are those that ``conf/algo/learner/`` has, and train the grid tasks well.
+
+    The paper states other values for some of them: ``tau=0.001``, a constant learning rate and no clipping of gradients
+    (``experiment=as_in_paper`` has them all).
 
     :class:`~hdrqn_torchrl.learning.learner.Learner` reads what concerns drawing and stepping. ``burn_in``,
     ``train_exact_states``, ``stored_state``, ``loss_function``, ``double`` and ``max_target`` concern the loss and what
@@ -27,10 +30,11 @@ class LearnerSettings:
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
         warmup_frames: environment frames before the first update.
         learning_rate: of Adam.
-        learning_rate_end: where it falls to, linearly, until ``learning_rate_frames``; ``None``: it stays.
-        learning_rate_frames: environment frames that this takes.
+        learning_rate_end: where it falls to, linearly, until ``learning_rate_frames``; ``None``: it stays constant.
+        learning_rate_frames: environment frames that this takes: those of the whole training. The default is that of
+            ``total_frames`` in ``conf/``.
         tau: rate of the soft target update.
-        max_grad_norm: gradients are clipped to this norm; ``None``: not at all.
+        max_grad_norm: gradients are clipped to this norm; ``None``: they are not clipped.
         burn_in: share of a sequence left out of the loss at its beginning; its steps only bring the recurrent state up
             to date. (Gradients flow back through it: what is remembered there is learned, too.) None without memory.
         train_exact_states: train leading steps whose recurrent state is exact (see
@@ -39,8 +43,8 @@ class LearnerSettings:
             mid-episode start from it instead of from zero (R2D2; Kapturowski et al., 2019). Costs 8 H bytes a step.
         sampling: how sequences are drawn (see :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         priority_exponent: alpha: draw sequences in proportion to ``priority**alpha``, where the priority is what the
-            loss reports; R2D2 has 0.9. ``None``: all alike.
-        importance_exponent: beta: weights ``priority**(-alpha * beta)`` make up for it in the loss; 1: in full.
+            loss reports; R2D2 has 0.9. ``None``: uniformly.
+        importance_exponent: beta: weights ``priority**(-alpha * beta)`` correct for it in the loss; 1: in full.
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest return there can be; targets are cut off above it. ``None``: what the task states, if it
@@ -59,10 +63,10 @@ class LearnerSettings:
     frames_per_update: float = 8.0
     warmup_frames: int = 5_000
     learning_rate: float = 1e-3
-    learning_rate_end: float | None = None
-    learning_rate_frames: int = 1_000_000
-    tau: float = 1e-3
-    max_grad_norm: float | None = None
+    learning_rate_end: float | None = 1e-4
+    learning_rate_frames: int = 800_000
+    tau: float = 3e-3
+    max_grad_norm: float | None = 10.0
     burn_in: float = 0.5
     train_exact_states: bool = True
     stored_state: bool = False
@@ -111,7 +115,7 @@ class LearnerSettings:
                 "priority_exponent",
                 self.priority_exponent is None or 0 < self.priority_exponent <= 1,
                 "in (0, 1] or None",
-                "use 0.9, or None to draw all alike",
+                "use 0.9, or None to draw uniformly",
             ),
             ("importance_exponent", 0 <= self.importance_exponent <= 1, "in [0, 1]", "use 0.6"),
             ("max_grad_norm", self.max_grad_norm is None or self.max_grad_norm > 0, "> 0 or None", "use 10"),

@@ -126,7 +126,7 @@ class TestThreeLevels:
             for time in range(played.shape[1]):
                 if played["rooms_option_init"][env, time]:
                     total, steps = 0.0, 0
-                total += 0.97**steps * paid[env, time].item()
+                total += 0.95**steps * paid[env, time].item()
                 steps += 1
                 assert collected[env, time].item() == pytest.approx(total, abs=1e-5)
         assert (paid != 0).any()

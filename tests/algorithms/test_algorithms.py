@@ -594,7 +594,7 @@ class TestV3:
         return algorithm, collect(algorithm, env, 40)[0]
 
     def test_one_update_moves_every_part_and_the_target_follows(self):
-        algorithm, batch = self.steps(learner={"tau": 0.25, "learning_rate": 0.1})
+        algorithm, batch = self.steps(learner={"tau": 0.25, "learning_rate": 0.1, "max_grad_norm": None})
         learner, network = algorithm.learners["joint"], algorithm.policy.network
         learner.store(batch)
         before = {name: p.detach().clone() for name, p in network.named_parameters()}

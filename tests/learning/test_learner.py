@@ -189,7 +189,7 @@ class TestUpdate:
         assert losses[-1] < 0.3 * losses[0] and learner.updates == 60
 
     def test_it_moves_the_acting_network_and_the_target_follows_at_the_rate_tau(self):
-        learner = make_learner(tau=0.25)
+        learner = make_learner(tau=0.25, max_grad_norm=None)
         learner.store(make_batch())
         before = learner.loss.value_network_params.data.clone()
         assert parameter_distance(before, learner.loss.target_value_network_params) == 0
@@ -375,8 +375,8 @@ class TestLearningRate:
             assert learner.optimizer.param_groups[0]["lr"] == learner.learning_rate
         assert rates == pytest.approx([1e-2, 8e-3, 6e-3, 4e-3, 2e-3, 2e-3])
 
-    def test_it_stays_without_an_end(self):
-        learner = make_learner(learning_rate=1e-2, learning_rate_frames=16)
+    def test_it_stays_constant_without_an_end(self):
+        learner = make_learner(learning_rate=1e-2, learning_rate_end=None, learning_rate_frames=16)
         learner.store(make_batch())
         assert learner.learning_rate == learner.optimizer.param_groups[0]["lr"] == 1e-2
 
