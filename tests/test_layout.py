@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import hdrqn_torchrl
-from hdrqn_torchrl.runs import layout
+from hdrqn_torchrl.runs import commands, layout
 
 ORDER = (
     "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "algorithms", "runs",
@@ -65,3 +65,12 @@ def test_one_module_knows_the_names_of_what_a_run_folder_holds(path):
     if path == Path(layout.__file__) or path.name == "configuration.py":  # conf/ has a config.yaml, too
         return
     assert not texts_of(path) & names
+
+
+PROGRAMS = {f"hdrqn_torchrl.cli.{name}" for name in commands.PROGRAMS}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_imports_from_a_program(path):
+    imported = {name if name in PROGRAMS else name.rpartition(".")[0] for name in imports_of(path)}
+    assert not imported & PROGRAMS

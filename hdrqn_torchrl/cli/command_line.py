@@ -74,3 +74,12 @@ def _is_text(schema: type, key: str, value: str) -> bool:
         optional = getattr(schema, key, MISSING) != MISSING  # then it may be null
         return not (value.startswith("[") and value.endswith("]")) and not (optional and value == "null")
     return hint in (str, str | None)
+
+
+def as_list(value: Any, *, split: bool = False) -> list:
+    """A setting that may be missing, one value or several, as a list; with ``split`` also ``a,b``."""
+    if value is None:
+        return []
+    if isinstance(value, list):
+        return value
+    return str(value).split(",") if split else [value]

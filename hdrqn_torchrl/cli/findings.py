@@ -12,7 +12,7 @@ from typing import Any
 
 from hdrqn_torchrl.analysis.archives import unpack
 from hdrqn_torchrl.analysis.grouping import Entry
-from hdrqn_torchrl.cli.plot import note, read_entries
+from hdrqn_torchrl.cli.entries import note, read_entries
 from hdrqn_torchrl.cli.studies import Job, is_run_of, jobs_of
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError

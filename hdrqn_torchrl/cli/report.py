@@ -33,9 +33,9 @@ from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves
 from hdrqn_torchrl.analysis.figures import plot_legs_over_time
 from hdrqn_torchrl.analysis.grouping import value_of
 from hdrqn_torchrl.analysis.results import final_value
-from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.cli.command_line import as_list, command_line
+from hdrqn_torchrl.cli.entries import common_references, note
 from hdrqn_torchrl.cli.findings import Found, Runs, read_runs, runs_of_jobs
-from hdrqn_torchrl.cli.plot import as_list, common_references, note
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError

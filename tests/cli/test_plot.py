@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from processes import ROOT
 
-from hdrqn_torchrl.cli import plot
+from hdrqn_torchrl.cli import entries, plot
 from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.runs import files
 
@@ -330,5 +330,5 @@ def test_many_runs_are_read_quickly(tmp_path, monkeypatch):
         files, "open_file", lambda path, *rest, **named: (reads.append(path), open_file(path, *rest, **named))[1]
     )
     monkeypatch.setattr("omegaconf.OmegaConf.load", None)
-    assert len(plot.read_entries([str(tmp_path / "outputs/**")])) == 5
+    assert len(entries.read_entries([str(tmp_path / "outputs/**")])) == 5
     assert len(reads) == len(set(reads)) == 20
