@@ -156,7 +156,7 @@ class TestGymnasium:
     def test_these_are_learned_from(self, name, kind):
         env = self.walks(kind)
         algorithm = build(name, env, PLAIN, prediction_steps=0)
-        assert algorithm.learners and not algorithm.task.in_order
+        assert algorithm.learners and not algorithm.task.ordered
         for batch in collect(algorithm, env, 9, 2):
             algorithm.observe(batch)
             assert (batch["next", "attained"].any(-1, keepdim=True) == (batch["next", "extrinsic_reward"] == 1)).all()
