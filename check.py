@@ -1,0 +1,6 @@
+"""Checks whether an environment keeps the contract of tasks, and says what each fault or gap costs."""
+
+from hdrqn_torchrl.cli.check import main
+
+if __name__ == "__main__":
+    main()

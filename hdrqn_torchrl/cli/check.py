@@ -1,0 +1,70 @@
+"""Checks whether an environment keeps the contract of tasks, and says what each fault or gap costs.
+
+    python check.py env=gridworld
+    python check.py env=mine --config-dir my_conf allowed_targets=[my_package.MyEnv]
+    python check.py env._target_=my_package.MyEnv allowed_targets=[my_package.MyEnv]
+
+The arguments are those of a training; seed and env are read. Four worlds are stepped with random actions. The exit code
+is 1 if something is wrong that prevents training, else 0. docs/own_tasks.md explains the contract.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from hydra import compose, initialize_config_dir
+from hydra.errors import HydraException
+from omegaconf import open_dict
+
+from hdrqn_torchrl.cli.configuration import CONF, resolved
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.building import build_env
+from hdrqn_torchrl.runs.commands import as_called
+from hdrqn_torchrl.runs.settings import RunSettings, check
+
+WORLDS = 4
+
+
+def main() -> None:
+    """Runs with the arguments of the command line."""
+    arguments = sys.argv[1:]
+    if {"-h", "--help"} & set(arguments):
+        print(as_called((__doc__ or "").strip()))
+        return
+    try:
+        found = check_settings(composed(arguments))
+    except SettingsError as error:
+        sys.exit(f"error: {error}")
+    print("\n".join(found) or "nothing is wrong or missing")
+    sys.exit(any(line.startswith("wrong") for line in found))
+
+
+def composed(arguments: list[str]) -> RunSettings:
+    """Settings as a training composes them, with ``--config-dir DIR`` among the arguments.
+
+    Raises:
+        SettingsError: if they can't be composed, or break a rule.
+    """
+    overrides = [*arguments]
+    while "--config-dir" in overrides:
+        place = overrides.index("--config-dir")
+        overrides[place : place + 2] = [f"hydra.searchpath=[file://{''.join(overrides[place + 1 : place + 2])}]"]
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose("config", overrides=overrides, return_hydra_config=True)
+    except HydraException as error:
+        raise SettingsError(str(error).splitlines()[0]) from error
+    with open_dict(config):
+        del config["hydra"]
+    settings = resolved(config)
+    check(settings)
+    return settings
+
+
+def check_settings(settings: RunSettings) -> list[str]:
+    """What is wrong with the environment of some settings, or missing in it."""
+    from hdrqn_torchrl.envs import check_task  # takes seconds: it loads torch
+
+    changes = {"seed": settings.seed, "device": "cpu", "num_envs": WORLDS}
+    env = build_env(settings, changes, settings.allowed_targets)
+    return [str(finding) for finding in check_task(env)]

@@ -1,0 +1,55 @@
+"""check.py: the contract of tasks on the command line."""
+
+import pytest
+
+from hdrqn_torchrl.cli import check
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Calls the program; returns its exit code and what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr("sys.argv", ["check.py", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            check.main()
+        return ended.value.code, capsys.readouterr().out
+
+    return call
+
+
+def test_a_task_of_the_package_has_no_fault_and_no_folder_is_made(run, tmp_path):
+    assert run("env=gridworld") == (0, "nothing is wrong or missing\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_environment_in_a_configuration_folder_of_ones_own(run, tmp_path):
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "small.yaml").write_text("defaults:\n  - gridworld\n  - _self_\nmax_steps: 5\n")
+    assert run("env=small", "--config-dir", str(tmp_path)) == (0, "nothing is wrong or missing\n")
+
+
+def test_what_is_wrong_ends_it_with_1(run, monkeypatch):
+    monkeypatch.setattr(check, "check_settings", lambda settings: ["wrong: 'reward' is missing (no agent)"])
+    assert run("env=gridworld") == (1, "wrong: 'reward' is missing (no agent)\n")
+
+
+@pytest.mark.parametrize(
+    ("argument", "told"),
+    [
+        ("env.view=4", "error: env.view must be an odd number"),
+        ("env._target_=mine.Env", "error: env._target_ must be one of the builders that this program trusts there"),
+        ("env=nothing", "error: In 'config': Could not find 'env/nothing'"),
+        ("env.veiw=4", "error: Could not override 'env.veiw'."),
+    ],
+)
+def test_a_wrong_argument_is_told(run, argument, told):
+    code, _ = run(argument)
+    assert code.startswith(told) and "\n" not in code
+
+
+def test_help(monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["hdrqn check", "--help"])
+    check.main()
+    assert "hdrqn check env=gridworld" in capsys.readouterr().out
