@@ -71,7 +71,7 @@ def references_of(entry: Entry, ceilings: str) -> References:
     if found := players(json.dumps(task_of(entry)), simulate=ceilings == "simulate"):
         return found
     _, logged = curve(entry.run, "greedy/ceiling")
-    return {"memory": {"return_mean": float(logged[-1])}} if len(logged) else {}
+    return {"ceiling": {"return_mean": float(logged[-1])}} if len(logged) else {}
 
 
 @lru_cache

@@ -172,8 +172,8 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players:
     )
     groups = (f"{name}={run.choices[name]}" for name in ("env", "algo", "network") if name in run.choices)
     title = " ".join([*groups, f"seed={run.config.seed}"])
-    references = players()  # only now all of them: training need not wait
     summary = folder.write_summary(run.folder, trainer, result, ceiling=trainer.ceiling())
+    references = players()  # all of them only now: neither training nor its result need wait
     with replaced(run.folder / layout.CURVES) as picture:
         plot_run(read_metrics(run.folder / layout.METRICS), picture, title=title, references=references)
     print(json.dumps({"run": str(run.folder), **summary}))

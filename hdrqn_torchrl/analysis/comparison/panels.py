@@ -55,6 +55,7 @@ _MARKERS = ("o", "s", "^", "D", "v", "p", "<", ">", "h")
 _PLAYERS: dict[str, tuple[str, Any]] = {  # line style and name of the scripted players
     "planner": ("ceiling: full information", (0, (1, 1.5))),
     "memory": ("ceiling: perfect memory", (0, (5, 2))),
+    "ceiling": ("ceiling", (0, (5, 2))),  # that a run has logged, of whichever player
     "egocentric": ("ceiling: memory, start unknown", (0, (3, 1, 1, 1, 1, 1))),
     "random": ("floor: random", (0, (5, 2, 1, 2))),
 }

@@ -21,7 +21,7 @@ ROOMS = keys.OptionKeys("rooms")  # of rooms and doors
 PLAYERS = {
     "planner": "full information",
     "memory": "perfect memory of the agent's own view",
-    "egocentric": "the same, but it must find out where it is",
+    "egocentric": "perfect memory, but not where it starts",
     "random": "chance",
 }
 
