@@ -1,0 +1,144 @@
+"""What README.md and docs/ show works: Python blocks run, and commands have settings that exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep
+from hydra.errors import ConfigCompositionException
+from run_folders import write_run
+
+from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.cli.configuration import CONF, resolved
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.commands import PROGRAMS
+from hdrqn_torchrl.runs.settings import check
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SHORTER = {
+    "total_frames=150_000": "total_frames=2_048",  # before the first update is due
+    "num_envs=250": "num_envs=4",
+    "episodes=250": "episodes=4",
+}
+"""What is replaced in Python blocks, so that they take seconds; test_learning.py runs the README's as it stands."""
+
+RUN = "outputs/gridworld-v2/2026-11-22_16-04-11-seed0"
+"""The run folder that the pages name."""
+
+
+def python_blocks(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(), flags=re.S)
+
+
+def commands(page: Path) -> list[str]:
+    """Command lines in shell blocks, and those that stand in a sentence."""
+    text = page.read_text()
+    lines = "\n".join(re.findall(r"```bash\n(.*?)```", text, flags=re.S)).splitlines()
+    quoted = re.findall(r"(?<!`)`((?:python |hdrqn |make )[^`\n]+)`(?!`)", text)
+    shown = [line.split("  #")[0].strip() for line in [*lines, *quoted] if line.strip() and "..." not in line]
+    return [re.sub(r"(?<=\s)\[([^\]]*)\](?=\s|$)", r"\1", line) for line in shown]  # [what may be left out]
+
+
+def calls(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Calls of this project's programs, as (program, arguments)."""
+    for line in commands(page):
+        words = shlex.split(line, comments=True)
+        if words[:2] == ["make", "train"]:
+            yield "train", shlex.split("".join(words[2:]).removeprefix("ARGS="))
+        elif words[0] == "hdrqn" and len(words) > 2:
+            yield words[1], words[2:]
+        elif words[0] == "python" and words[1].removesuffix(".py") in PROGRAMS:
+            yield words[1].removesuffix(".py"), words[2:]
+
+
+def jobs(arguments: list[str]) -> list[list[str]]:
+    """Overrides of jobs that a call of train.py starts: each value of a swept setting occurs; of a range, its start."""
+    overrides = [argument for argument in arguments if "=" in argument or argument.startswith("~")]
+    values = []
+    for override in OverridesParser.create().parse_overrides(overrides):
+        if not override.is_sweep_override():
+            values.append([override.input_line])
+        elif isinstance(override.value(), IntervalSweep):
+            values.append([f"{override.key_or_group}={override.value().start}"])
+        else:
+            values.append([f"{override.key_or_group}={value}" for value in override.sweep_string_iterator()])
+    first = [each[0] for each in values]
+    return [first, *([*first[:at], other, *first[at + 1 :]] for at, each in enumerate(values) for other in each[1:])]
+
+
+@cache
+def check_training(overrides: tuple[str, ...]) -> None:
+    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        check(resolved(compose("config", overrides=list(overrides))))
+
+
+def without_seed(job: list[str]) -> tuple[str, ...]:
+    return tuple(override for override in job if not override.startswith("seed="))
+
+
+pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+
+
+@pages
+def test_python_blocks_run_one_after_the_other(page, tmp_path, monkeypatch):
+    run = tmp_path / RUN
+    run.mkdir(parents=True)
+    write_run(run)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {"__name__": page.stem}
+    for number, code in enumerate(python_blocks(page), start=1):
+        if "(self, ...)" in code:  # a sketch: what it imports is there
+            code = "\n".join(line for line in code.splitlines() if line.startswith(("from ", "import ")))
+        for shown, run in SHORTER.items():
+            code = code.replace(shown, run)
+        torch.manual_seed(0)
+        exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+
+
+@pages
+def test_commands_have_settings_that_exist(page, monkeypatch):
+    for program, arguments in calls(page):
+        if program == "train":
+            if "--config-dir" not in arguments:
+                for job in jobs(arguments):
+                    check_training(without_seed(job))
+        else:
+            seen: list = []
+            monkeypatch.setattr(sys, "argv", [f"{program}.py", *arguments])
+            command_line(import_module(f"hdrqn_torchrl.cli.{program}").Settings, "", seen.append)
+            assert seen or arguments == ["--help"]
+
+
+@pages
+def test_scripts_that_are_called_exist(page):
+    for line in commands(page):
+        words = shlex.split(line, comments=True)
+        if words[0] == "python" and words[1].endswith(".py"):
+            assert (ROOT / words[1]).is_file(), line
+
+
+def test_a_setting_that_does_not_exist_is_noticed():
+    with pytest.raises(ConfigCompositionException):
+        check_training(("algo=v3", "algo.sub.tau=1"))
+    with pytest.raises(SettingsError):
+        check_training(("algo=v3", "+colour=red"))
+
+
+def test_jobs_cover_every_value_of_a_sweep():
+    swept = jobs(["algo=v1,v2", "seed=0,1", "algo.gamma=interval(0.9,1)"])
+    assert [" ".join(job) for job in swept] == [
+        "algo=v1 seed=0 algo.gamma=0.9",
+        "algo=v2 seed=0 algo.gamma=0.9",
+        "algo=v1 seed=1 algo.gamma=0.9",
+    ]
