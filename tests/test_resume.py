@@ -33,6 +33,10 @@ TRAININGS = {
         options={"sub_hindsight": True, "meta_hindsight": True, "meta_input_time": "after_last_observation"},
     ),
     "v2-phases": partial(make_training, name="v2", options={"phase_one": PhaseOne(max_frames=64)}),
+    "v1-three-levels": partial(make_training, name="v1", worlds=house, options={"levels": 3}),
+    "v2-three-levels": partial(
+        make_training, name="v2", worlds=house, options={"levels": 3, "refresh_hidden_steps": 7, "sub_hindsight": True}
+    ),
     "v3": partial(make_training, name="v3"),
     "v3-three-levels": partial(make_training, name="v3", worlds=house, options={"levels": 3}),
     "v1-r2d2": partial(
