@@ -305,14 +305,14 @@ def test_the_best_and_the_last_weights_are_kept(tmp_path):
 class TestStopRequests:
     def test_one_between_two_updates_leaves_the_rest_owed(self, tmp_path):
         learner = CountingLearner(5)
-        update = learner.update
+        learn = learner.learn
 
-        def update_and_stop(sample):
+        def learn_and_stop():
             if learner.updates == 6:
                 signal.raise_signal(signal.SIGTERM)
-            return update(sample)
+            return learn()
 
-        learner.update = update_and_stop
+        learner.learn = learn_and_stop
         trainer = make_trainer(
             total_frames=100, learners={"flat": learner}, log_frames=10, checkpoints=Checkpoints(tmp_path)
         )
