@@ -262,3 +262,14 @@ def test_a_bound_that_a_job_leaves_to_the_task_is_not_asked_for():
     assert not is_run_of(unbounded, {"algo.sub.max_target": 1.0})
     assert is_run_of(unbounded, {"algo.sub.max_target": None})  # what it was called before
     assert not is_run_of(Job({}, {}), {"algo.sub.max_target": 1.0})
+
+
+def test_an_evaluation_that_can_not_be_read_is_named_and_left_out(tmp_path, capsys):
+    folder = tmp_path / "evaluations"
+    folder.mkdir()
+    (folder / "greedy.json").write_text('{"episodes": 3}')
+    (folder / "broken.json").write_text("{")
+    (folder / "elsewhere.json").symlink_to(folder / "greedy.json")
+    assert report.evaluations_of(tmp_path) == [{"episodes": 3}]
+    told = capsys.readouterr().err
+    assert "broken.json must be a JSON file" in told and "elsewhere.json must be what a run leaves there" in told
