@@ -124,6 +124,8 @@ def make_v3(
     _check_learner(learner)
     if joint and meta_learning_rate is not None:
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
+    if phase_one is not None and levels == 1:
+        raise ValueError("phase_one must be None with levels=1: it is about the choice of subgoals; use levels=2.")
     if bonus_reward and levels > 1:
         raise ValueError(
             f"bonus_reward must be 0 with levels={levels}, got {bonus_reward}; their critic already rewards subgoals."
