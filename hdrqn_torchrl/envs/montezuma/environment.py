@@ -61,7 +61,7 @@ class MontezumaEnv(EnvBase):
         actions: ALE's numbers of the actions the agent has; :data:`USEFUL_ACTIONS` are enough.
         one_life: an episode ends with the first death. Else the step in which the agent dies lasts until its next life.
         locator: where ``position`` comes from: ``"ram"`` or ``"pixels"`` (the agent's colours on the screen).
-        noops: an episode begins with 0 to so many steps of doing nothing, drawn anew each time. Without them (and
+        noops: an episode begins with a random number of steps of doing nothing, at most this many. Without them (and
             without sticky actions) the game is deterministic.
         practice: share of episodes that do not begin at the start but at a subgoal that was attained before, drawn
             among those. (Not in the paper.)
