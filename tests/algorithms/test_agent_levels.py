@@ -9,6 +9,7 @@ from torchrl.modules import set_recurrent_mode
 from hdrqn_torchrl.algorithms import Level, make_v3
 from hdrqn_torchrl.algorithms.levels import make_levels
 from hdrqn_torchrl.envs import MultiGoalGridEnv, SubgoalSet
+from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
 
 
@@ -130,3 +131,8 @@ class TestThreeLevels:
                 steps += 1
                 assert collected[env, time].item() == pytest.approx(total, abs=1e-5)
         assert (paid != 0).any()
+
+
+def test_a_flat_agent_has_no_first_phase():
+    with pytest.raises(ValueError, match=r"phase_one must be None with levels=1"):
+        agent(house(), 1, phase_one=PhaseOne())
