@@ -89,34 +89,27 @@ class RawLearner:
         self.optimizer = torch.optim.Adam(self.parameters, lr=LEARNING_RATE, fused=True)
 
     def loss(self, batch: Batch) -> Tensor:
-        """Mean squared TD error over the trained steps."""
+        """Mean squared TD error over the trained steps of sequences of T + 1; the last only shows what came of T."""
         valid, init = batch["valid"], batch["init"] & batch["valid"]
-        stream = self.stream(batch, "observation")
-        subgoal = self.stream(batch, "condition") if "condition" in batch else None
-        restart = torch.cat([init, torch.zeros_like(init[:, :1])], 1) if "condition" in batch else None
+        stream, subgoal = batch["observation"], batch.get("condition")
+        restart = None if subgoal is None else init
         with torch.no_grad():
             target = self.target(stream, subgoal, restart)[:, 1:]
         online = self.online(stream, subgoal, restart)
-        chosen = online[:, :-1].gather(-1, batch["action"].unsqueeze(-1)).squeeze(-1)
+        now = {name: value[:, :-1] for name, value in batch.items()}
+        chosen = online[:, :-1].gather(-1, now["action"].unsqueeze(-1)).squeeze(-1)
         with torch.no_grad():
             best = online[:, 1:]
             if "mask" in batch:
-                next_mask = self.stream(batch, "mask")[:, 1:]
+                next_mask = batch["mask"][:, 1:]
                 best = best.masked_fill(~next_mask & next_mask.any(-1, keepdim=True), -torch.inf)
             next_value = target.gather(-1, best.argmax(-1, keepdim=True)).squeeze(-1)
-            discount = GAMMA ** batch["steps"] if "steps" in batch else GAMMA
-            wanted = batch["reward"] + (discount * next_value).masked_fill(batch["terminated"], 0.0)
-            time = torch.arange(valid.shape[1])
-            trained = (time >= len(time) // 2) | (init.cumsum(1) > 0)
-            followed = torch.cat([valid[:, 1:], torch.zeros_like(valid[:, :1])], 1)
-            trained &= valid & ~(batch["done"] & ~batch["terminated"] & followed)
+            discount = GAMMA ** now["steps"] if "steps" in batch else GAMMA
+            wanted = now["reward"] + (discount * next_value).masked_fill(now["terminated"], 0.0)
+            time = torch.arange(chosen.shape[1])
+            trained = (time >= len(time) // 2) | (init[:, :-1].cumsum(1) > 0)
+            trained &= now["valid"] & (now["terminated"] | (~now["done"] & valid[:, 1:]))
         return (chosen - wanted).square().mul(trained).sum() / trained.sum().clamp(min=1)
-
-    def stream(self, batch: Batch, name: str) -> Tensor:
-        """The T + 1 inputs of T transitions; a padded step shows what followed the last real one."""
-        now, following, valid = batch[name], batch["next_" + name], batch["valid"]
-        now = torch.where(valid.view(*valid.shape, *[1] * (now.ndim - 2)), now, following)
-        return torch.cat([now, following[:, -1:]], 1)
 
     def update(self) -> Tensor:
         """One gradient step and one target update."""
@@ -153,9 +146,6 @@ def flatten(level: str, version: str, steps: TensorDictBase) -> Batch:
         },
     }[level]
     batch = {name: steps[key] for name, key in source.items()}
-    batch |= {
-        f"next_{name}": steps["next", source[name]] for name in ("observation", "condition", "mask") if name in source
-    }
     per_step = ("init", "reward", "steps", "done", "terminated")
     return {name: value.squeeze(-1) if name in per_step else value for name, value in batch.items()}
 
@@ -168,7 +158,7 @@ def raw_twin(learner: Learner, level: str, version: str) -> RawLearner:
     episode = stored["collector", "traj_ids"]
     order = episode.argsort(stable=True)
     rows = flatten(level, version, stored[order].contiguous())
-    replay = RawReplay(rows, episode[order], settings.slice_len, settings.batch_size)
+    replay = RawReplay(rows, episode[order], settings.slice_len + 1, settings.batch_size)
     return RawLearner(learner.network.network, replay)
 
 

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from helpers import build, collect, small_env, tiny_settings
+from helpers import build, collect, options_of, small_env, tiny_settings
 from tensordict import TensorDict
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
@@ -242,7 +242,7 @@ class TestActingAndLearningAgree:
         settings = tiny_settings(stored_state=True)
         algorithm, steps = self.collected(name, "compact", settings=settings, max_option_steps=2)
         meta = algorithm.policy.meta_controller
-        stored = algorithm.learners["meta"].extract(steps)
+        stored, _ = options_of(algorithm.learners["meta"].extract(steps))
         starts = steps[steps["option_init"].squeeze(-1)]
         acted = meta.network.head(starts["next", "meta_hidden"]).detach()
         place = {(row["collector", "traj_ids"].item(), *row["meta_hidden"].tolist()): i for i, row in enumerate(starts)}
@@ -366,3 +366,38 @@ def test_epsilon_reaches_the_workers_with_the_weights():
         assert greedy_share() == 1.0
     finally:
         collector.shutdown()
+
+
+class TestMiddleController:
+    """A controller between two others: told a subgoal, with a memory that begins anew where that was chosen."""
+
+    def make(self):
+        names = {"condition_key": "goal", "init_key": "goal_init", "mask_key": None}
+        return MetaController(make_network(num_conditions=2), input_keys=["observation"], **names)
+
+    def test_its_state_restarts_where_the_level_above_chose_and_is_kept_where_it_is_not_its_turn(self):
+        meta = self.make()
+        gate, init = torch.tensor([[True], [True], [False]]), torch.tensor([[False], [True], [False]])
+        td = root(option_init=gate, goal=torch.tensor([0, 1, 1]), goal_init=init)
+        zeroed = td.clone()
+        for key in ("meta_hidden", "meta_cell"):
+            zeroed[key][1] = 0.0
+        found, expected = meta(td.clone())["next"], meta(zeroed.clone())["next"]
+        for key in ("meta_hidden", "meta_cell"):
+            torch.testing.assert_close(found[key], expected[key])
+            assert torch.equal(found[key][2], td[key][2]) and (found[key][:2] != td[key][:2]).any(-1).all()
+
+    def test_what_it_is_told_changes_what_it_learns(self):
+        meta = self.make()
+        sequence = {"observation": torch.randn(1, 4, 2), "goal_init": torch.zeros(1, 4, 1, dtype=torch.bool)}
+        values = []
+        for goal in (0, 1):
+            td = TensorDict({**sequence, "goal": torch.full((1, 4), goal)}, [1, 4])
+            with set_recurrent_mode(True):
+                values.append(meta(td)["subgoal_value"])
+        assert (values[0] != values[1]).any(-1).all()
+
+    @pytest.mark.parametrize("names", [{}, {"condition_key": "goal"}, {"init_key": "goal_init"}], ids=str)
+    def test_condition_and_restart_belong_together(self, names):
+        with pytest.raises(ValueError, match="condition_key and init_key must be None exactly when the network has no"):
+            MetaController(make_network(num_conditions=2), **names)
