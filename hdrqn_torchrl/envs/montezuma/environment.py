@@ -16,6 +16,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.montezuma.emulators import Emulators, Snapshot
 from hdrqn_torchrl.envs.montezuma.practice import PracticeStarts
 from hdrqn_torchrl.envs.montezuma.screen import (
+    ALL_ACTIONS,
     DOOR_SCORE,
     DOORS,
     SUBGOALS,
@@ -24,12 +25,8 @@ from hdrqn_torchrl.envs.montezuma.screen import (
     boxes_of,
     locate,
 )
-from hdrqn_torchrl.envs.montezuma.task import montezuma_task
+from hdrqn_torchrl.envs.montezuma.task import check_settings, montezuma_task
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
-
-ALL_ACTIONS = tuple(range(18))
-USEFUL_ACTIONS = (0, 1, 2, 3, 4, 5, 11, 12)
-"""Nothing, jump, up, right, left, down, jump right, jump left; the other ten do the same in this game."""
 
 _LONGEST_DEATH = 40  # steps from an impact to the next life
 
@@ -101,20 +98,9 @@ class MontezumaEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be >= 1, got {num_envs}; use 16 for training on one core.")
-        if max_steps < 1:
-            raise ValueError(f"max_steps must be >= 1, got {max_steps}; key and door take 167 steps.")
-        if noops < 0:
-            raise ValueError(f"noops must be >= 0, got {noops}; evaluations use 30.")
-        if not 0.0 <= practice <= 1.0:
-            raise ValueError(f"practice must lie in [0, 1], got {practice}; it is a share of episodes.")
-        if locator not in ("ram", "pixels"):
-            raise ValueError(f"locator must be 'ram' or 'pixels', got {locator!r}; 'ram' is exact.")
-        if not actions or not set(actions) <= set(ALL_ACTIONS) or len(set(actions)) < len(actions):
-            raise ValueError(
-                f"actions must be different numbers from 0 to 17, got {list(actions)}; use USEFUL_ACTIONS."
-            )
+        check_settings(
+            num_envs=num_envs, max_steps=max_steps, noops=noops, practice=practice, locator=locator, actions=actions
+        )
         super().__init__(device=torch.device(device or "cpu"), batch_size=(num_envs,))
         self.subgoals, self.key_and_door = boxes_of(subgoals), key_and_door
         self._near = keys.OptionKeys("places" if key_and_door else "")

@@ -41,6 +41,9 @@ DOORS = ("left_door", "right_door")
 DOOR_SCORE = 300.0
 """What a door brings; the key brings 100."""
 
+ALL_ACTIONS = tuple(range(18))
+USEFUL_ACTIONS = (0, 1, 2, 3, 4, 5, 11, 12)
+"""Nothing, jump, up, right, left, down, jump right, jump left; the other ten do the same in this game."""
 ACTION_NAMES = (
     "noop", "jump", "↑ up", "→ right", "← left", "↓ down", "↗ up right", "↖ up left", "↘ down right", "↙ down left",
     "jump ↑", "jump →", "jump ←", "jump ↓", "jump ↗", "jump ↖", "jump ↘", "jump ↙",

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
-from hdrqn_torchrl.envs.montezuma.screen import ACTION_NAMES
+from hdrqn_torchrl.envs.montezuma.screen import ACTION_NAMES, ALL_ACTIONS
 from hdrqn_torchrl.envs.task import SubgoalSet, Task
 
 if TYPE_CHECKING:
@@ -51,3 +51,25 @@ def screen_scene(env: EnvBase, *, subgoal: int | None = None, action: int | None
 def first_screen(env: EnvBase) -> NDArray[np.uint8]:
     """The screen on which an episode begins, ``[210, 160, 3]``."""
     return env.emulators.start.screen
+
+
+def check_settings(
+    *, num_envs: int, max_steps: int, noops: int, practice: float, locator: str, actions: Sequence[int]
+) -> None:
+    """Refuses settings of a :class:`~hdrqn_torchrl.envs.MontezumaEnv` that break a rule.
+
+    Raises:
+        ValueError: naming setting, rule and value.
+    """
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be >= 1, got {num_envs}; use 16 for training on one core.")
+    if max_steps < 1:
+        raise ValueError(f"max_steps must be >= 1, got {max_steps}; key and door take 167 steps.")
+    if noops < 0:
+        raise ValueError(f"noops must be >= 0, got {noops}; evaluations use 30.")
+    if not 0.0 <= practice <= 1.0:
+        raise ValueError(f"practice must lie in [0, 1], got {practice}; it is a share of episodes.")
+    if locator not in ("ram", "pixels"):
+        raise ValueError(f"locator must be 'ram' or 'pixels', got {locator!r}; 'ram' is exact.")
+    if not actions or not set(actions) <= set(ALL_ACTIONS) or len(set(actions)) < len(actions):
+        raise ValueError(f"actions must be different numbers from 0 to 17, got {list(actions)}; use USEFUL_ACTIONS.")

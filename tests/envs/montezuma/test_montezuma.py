@@ -9,9 +9,9 @@ from torchrl.envs.utils import check_env_specs, step_mdp
 pytest.importorskip("ale_py")
 
 from hdrqn_torchrl.envs import check_task, task_of
-from hdrqn_torchrl.envs.montezuma.environment import ALL_ACTIONS, USEFUL_ACTIONS, MontezumaEnv
+from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv
 from hdrqn_torchrl.envs.montezuma.making import make_montezuma
-from hdrqn_torchrl.envs.montezuma.screen import BOXES, SUBGOALS, locate
+from hdrqn_torchrl.envs.montezuma.screen import ALL_ACTIONS, BOXES, SUBGOALS, USEFUL_ACTIONS, locate
 from hdrqn_torchrl.rendering import scene_of
 
 ROUTE = json.loads((Path(__file__).parent / "montezuma_route.json").read_text())
