@@ -25,7 +25,8 @@ from hdrqn_torchrl.runs.commands import PROGRAMS
 from hdrqn_torchrl.runs.settings import check
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 SHORTER = {
     "total_frames=150_000": "total_frames=2_048",  # before the first update is due
     "num_envs=250": "num_envs=4",

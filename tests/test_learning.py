@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import build, make_collector, small_env, tiny_settings
+from test_docs import README, python_blocks
 
 from hdrqn_torchrl.algorithms import make_hdrqn, make_v3, presets
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
@@ -83,13 +84,24 @@ def quick_v3(env):
     ("make", "frames", "threshold"), [(quick_v2, 14_336, 0.7), (quick_v3, 12_288, 0.8)], ids=["v2", "v3"]
 )
 def test_agents_learn_to_reach_two_goals_in_order(make, frames, threshold):
-    """Share of greedy episodes with both goals in order, 3x3 cells seen 3x3 at a time, 16 steps an episode.
+    """Share of greedy episodes with both goals in order, in a room of 3x3 cells with a 3x3 view, within 16 steps.
 
-    MEASURED
+    Seeds 0 to 4: v2 0.945, 0.945, 0.895, 0.86, 0.955; v3 0.95, 0.945, 0.925, 0.975, 0.965. They take 13 and 9 seconds
+    of one core. Broken on purpose (seed 0): with rewards of the wrong sign v2 reaches 0.0, and v3 0.29 with the wrong
+    sign of the task's reward alone; with a target network that never follows v2 reaches 0.305. This test does not
+    notice such a target network in v3 (0.91), nor subgoals chosen at random while training, which are exploration
+    (0.91 and 0.94).
     """
     env = small_env(32, **TASK)
     after, before = train(make(env), env, frames)
     assert before < 0.1 and after > threshold
+
+
+@pytest.mark.slow
+def test_the_readme_s_training_learns(capsys):
+    """As it stands, with default arguments; a random agent's return is about 0.1."""
+    exec(python_blocks(README)[0], {"__name__": "readme"})
+    assert float(capsys.readouterr().out.split()[-1]) > 0.6
 
 
 @pytest.mark.slow
