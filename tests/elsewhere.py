@@ -1,4 +1,4 @@
-"""Tensors that stand for those of a GPU where there is none."""
+"""Tensors that stand in for those of a GPU."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch.utils._pytree import tree_leaves
 
 
 class Elsewhere(Tensor):
-    """A tensor that can't become an array, nor meet one of the host (but for single numbers)."""
+    """A tensor that can't become an array, nor be combined with the host's tensors (except single numbers)."""
 
     @classmethod
     def __torch_function__(cls, function, types, args=(), kwargs=None):
@@ -23,7 +23,7 @@ class Elsewhere(Tensor):
 
 
 def elsewhere(state):
-    """A state as it is when a checkpoint is loaded onto a GPU: all of its tensors are there."""
+    """A state as if its checkpoint had been loaded onto a GPU: with all of its tensors there."""
     if isinstance(state, Tensor):
         return state.clone().as_subclass(Elsewhere)
     if isinstance(state, TensorDictBase):

@@ -63,7 +63,7 @@ def subgoal_env(num_envs: int = 4, *, env_settings: dict | None = None, **settin
 
 
 def tiny_settings(**changes) -> LearnerSettings:
-    """A learner that updates at once and often."""
+    """Settings of a learner that starts updating at once, and often."""
     defaults = {"slice_len": 4, "batch_size": 4, "capacity": 2_000, "frames_per_update": 16, "warmup_frames": 0}
     return LearnerSettings(**(defaults | changes))
 
@@ -114,7 +114,7 @@ def make_training(
     worlds: Callable[..., MultiGoalGridEnv] = small_env,
     **settings,
 ) -> Trainer:
-    """A whole training with real parts, so small that its memories wrap and dozens of episodes end in 256 frames.
+    """A complete training, so small that its memories wrap and dozens of episodes end within 256 frames.
 
     Args:
         folder: run folder.
@@ -158,7 +158,7 @@ def table(folder: Path) -> list[dict[str, str]]:
 
 
 def contents(folder: Path) -> dict:
-    """Everything in the newest checkpoint of a run but the clock: parts of the structure, and bytes of tensors."""
+    """Everything in the newest checkpoint of a run except clock times: the structure, and the bytes of tensors."""
     newest = max((folder / "checkpoints").iterdir())
     found: dict = {"step": newest.name, "score": Checkpoint.manifest(newest)["metadata"]}
     for part in (newest / "components").iterdir():
@@ -176,20 +176,20 @@ def _without_clock(node):
 
 
 def check_same(folder: Path, reference: Path) -> None:
-    """Compares two runs whole, with no tolerance."""
+    """Compares two complete runs, without tolerance."""
     check_same_checkpoint(folder, reference)
     assert table(folder) == table(reference)
 
 
 def check_same_checkpoint(folder: Path, reference: Path) -> None:
-    """Compares the newest checkpoints of two runs whole, with no tolerance."""
+    """Compares the complete newest checkpoints of two runs, without tolerance."""
     found, expected = contents(folder), contents(reference)
     assert found.keys() == expected.keys() and len(found) > 50
     assert [key for key in found if found[key] != expected[key]] == []
 
 
 def seed_everything(seed: int) -> None:
-    """All global random generators."""
+    """Seeds all global random generators."""
     random.seed(seed)
     numpy.random.seed(seed)
     torch.manual_seed(seed)
@@ -213,7 +213,7 @@ def batches_of(steps: TensorDictBase, length: int) -> list[TensorDictBase]:
 
 
 def options_of(rows: TensorDictBase, *inputs: str) -> tuple[TensorDictBase, torch.Tensor]:
-    """Options among stored rows ``[M]``, with what each led to under ``"next"``, as the row behind it shows.
+    """Options among stored rows ``[M]``, with their outcomes under ``"next"``, taken from the following row.
 
     Final rows are taken out, and the options before them are done. Returns with the options where what they led to is
     known, ``[M]`` bool.
@@ -255,7 +255,7 @@ def parameter_distance(first: TensorDictBase, second: TensorDictBase) -> float:
 
 
 class State:
-    """A component that is nothing but its state."""
+    """A component that consists of its state only."""
 
     def __init__(self, state=None):
         self.state = state

@@ -1,4 +1,4 @@
-"""Processes that start at once: they are forked from one that has imported everything and done nothing else."""
+"""Processes that start fast: they are forked from one that has only imported everything."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def _run_script(folder: Path, arguments: tuple[str, ...], prepare: Callable[[], 
 
 
 def limit_file_size(size: int) -> None:
-    """Lets the kernel refuse to write beyond ``size`` bytes of a file, like a full disk."""
+    """Makes the kernel refuse writes beyond ``size`` bytes of a file, like a full disk."""
     _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
 
 
 @contextmanager
 def limited_file_size(size: int) -> Iterator[None]:
-    """:func:`limit_file_size` for a while."""
+    """:func:`limit_file_size` inside a ``with`` block."""
     before, _ = resource.getrlimit(resource.RLIMIT_FSIZE)
     limit_file_size(size)
     try:
@@ -104,14 +104,14 @@ class Diary:
 
 
 def leftovers(folder: Path) -> int:
-    """Bytes in a run folder that belong to no checkpoint and no log."""
+    """Number of bytes in a run folder that belong to no checkpoint or log."""
     stray = [*folder.glob("checkpoints/.*"), *folder.glob("*.partial")]
     files = [file for path in stray for file in (path, *path.rglob("*")) if file.is_file()]
     return sum(file.stat().st_size for file in files) + len(stray)  # an empty file or folder is one, too
 
 
 def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None:
-    """What train.py does in a run folder, be it empty or left by a killed process, with a training of helpers.py."""
+    """What train.py does in an empty run folder or that of a killed process, with a training from helpers.py."""
     from helpers import make_training, seed_everything
 
     from hdrqn_torchrl.cli import train

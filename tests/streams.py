@@ -1,11 +1,11 @@
-"""Numbered steps of episodes whose ends are known, and what sequences drawn from them must be."""
+"""Numbered steps of episodes with known ends, and checks of the sequences drawn from them."""
 
 import torch
 from tensordict import TensorDict
 
 
 class Stream:
-    """Consecutive batches of numbered steps; episodes last 1 to 9 steps and end at other times in each environment."""
+    """Consecutive batches of numbered steps; episodes last 1 to 9 steps, and environments are not in step."""
 
     def __init__(self, num_envs):
         self.num_envs, self.next_episode = num_envs, 0
@@ -34,7 +34,7 @@ class Stream:
 
 
 def check_sequences(sequences, slice_len, newest):
-    """Each is one trajectory with consecutive steps, at least one of them real, padded only where it ends."""
+    """Checks that each sequence is one trajectory of consecutive steps, at least one real, padded only at its end."""
     traj, step = sequences["collector", "traj_ids"], sequences["step"]
     real = sequences.get(("collector", "mask"), torch.ones_like(step, dtype=torch.bool))
     assert sequences.shape[1] == slice_len

@@ -1,4 +1,4 @@
-"""A GPU is built for, and there is none here: what it would wait for, found on a CPU, and what would not be on it."""
+"""Checks for GPUs that run on a CPU: operations that would make the host wait, and tensors on the wrong device."""
 
 import sys
 
@@ -25,7 +25,7 @@ DRAWN_BY_THE_HOST = "_local_scalar_dense objectives/prediction.py:prediction_los
 
 @pytest.fixture
 def as_on_gpu(monkeypatch):
-    """No code looks into a tensor to save work."""
+    """Makes all code take the path for GPUs, which never reads a tensor to save work."""
     users = [module for name, module in sys.modules.items() if name.startswith("hdrqn") and hasattr(module, "on_host")]
     assert len(users) > 5
     for module in users:
@@ -44,7 +44,7 @@ def make(name, env=None, **options):
     return algorithm, env
 
 
-class TestTheFinder:
+class TestFindWaits:
     x, mask = torch.arange(4.0), torch.tensor([True, False, True, False])
 
     @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ class TestTheFinder:
             lambda x, mask: TensorDict(x=x, batch_size=4)[mask],
         ],
     )
-    def test_finds(self, wait):
+    def test_operations_that_wait_for_a_device_are_found(self, wait):
         with HostWaits() as waits:
             wait(self.x, self.mask)
         assert waits.found
@@ -91,12 +91,12 @@ class TestTheFinder:
             lambda x, mask: x.argsort(),
         ],
     )
-    def test_leaves_alone(self, work):
+    def test_operations_that_do_not_wait_are_not_reported(self, work):
         with HostWaits() as waits:
             work(self.x, self.mask)
         assert waits.found == []
 
-    def test_it_tells_the_place(self):
+    def test_the_place_in_the_package_is_reported(self):
         algorithm, env = make("drqn")
         learner = algorithm.learners["flat"]
         learner.store(collect(algorithm, env, 8)[0])
@@ -107,8 +107,8 @@ class TestTheFinder:
 
 class TestNothingWaits:
     @pytest.mark.parametrize("name", EVERY)
-    def test_in_a_step(self, name, as_on_gpu):
-        """Decision, worlds and option book. TorchRL looks whether an episode is over, outside of what is run here."""
+    def test_a_step_of_acting_waits_for_nothing(self, name, as_on_gpu):
+        """Decision, worlds and option book. (TorchRL's own check for the end of episodes is not part of this.)"""
         algorithm, env = make(name)
         transformed = algorithm.transform(env)
         td = transformed.reset()
@@ -124,7 +124,7 @@ class TestNothingWaits:
 
     @pytest.mark.parametrize("precision", ["fp32", "bf16"])
     @pytest.mark.parametrize("name", EVERY)
-    def test_in_an_update(self, name, precision, as_on_gpu):
+    def test_an_update_waits_for_nothing(self, name, precision, as_on_gpu):
         algorithm, env = make(name)
         batch = collect(algorithm, env, 10)[0]
         for learner in algorithm.learners.values():
@@ -137,7 +137,7 @@ class TestNothingWaits:
                     learner.update(sample)
             assert set(waits.found) <= {DRAWN_BY_THE_HOST} and learner.updates == 3
 
-    def test_with_the_papers_network(self, as_on_gpu):
+    def test_the_papers_network_waits_for_nothing(self, as_on_gpu):
         env = small_env(2)
         algorithm = build("v2", env, paper_network(8), settings=tiny_settings(slice_len=2))
         batch = collect(algorithm, env, 8)[0]
@@ -151,8 +151,8 @@ class TestNothingWaits:
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_what_waits_in_an_iteration_does_so_once_per_batch(name, as_on_gpu, tmp_path):
-    """With more updates no more does; the places are known."""
+def test_operations_that_wait_do_so_once_per_batch(name, as_on_gpu, tmp_path):
+    """The number does not grow with the number of updates, and the places are known."""
     found = []
     for updates in (2, 8):  # of one draw
         trainer = make_training(tmp_path / str(updates), name, log_frames=10**9, evaluation_frames=10**9)
@@ -184,12 +184,12 @@ def test_what_waits_in_an_iteration_does_so_once_per_batch(name, as_on_gpu, tmp_
     assert {wait.split()[1] for wait in found[0]} == expected
 
 
-class TestBothWaysAgree:
-    """What a GPU does in order not to wait comes to the same."""
+class TestHostAndDevicePathsAgree:
+    """The paths that avoid waiting for a GPU give the same results."""
 
     @pytest.mark.parametrize("precision", ["fp32", "bf16"])
     @pytest.mark.parametrize("name", EVERY)
-    def test_updates(self, name, precision, request):
+    def test_updates_of_both_paths_agree(self, name, precision, request):
         losses = []
         for gpu in (False, True):
             torch.manual_seed(0)
@@ -205,7 +205,7 @@ class TestBothWaysAgree:
         exact = {"rel": 1e-5} if precision == "fp32" else {"rel": 3e-2, "abs": 1e-3}
         assert losses[:half] == pytest.approx(losses[half:], **exact) and half == 4 * len(algorithm.learners)
 
-    def test_new_worlds_come_only_where_an_episode_ended(self, as_on_gpu):
+    def test_only_worlds_whose_episode_ended_are_reset(self, as_on_gpu):
         env = small_env(300, max_steps=9)
         env.steps += 3
         before, ended = env.state, torch.arange(300) % 3 == 0
@@ -217,7 +217,7 @@ class TestBothWaysAgree:
         assert (new.sort(-1).values.diff(dim=-1) > 0).all()  # nothing shares a cell
         assert (new != torch.cat([before.agent[ended, None], before.objects[ended]], -1)).any(-1).float().mean() > 0.9
 
-    def test_an_obstacle_that_was_hit_moves_to_a_free_cell_and_no_other_does(self, as_on_gpu):
+    def test_only_the_obstacle_that_was_hit_moves_to_a_free_cell(self, as_on_gpu):
         env = small_env(64, obstacle="teleport", num_obstacles=2)
         hits = 0
         for _ in range(20):
@@ -235,7 +235,7 @@ class TestBothWaysAgree:
 
 
 class TestEverythingIsOnOneDevice:
-    """The meta device holds no numbers: to look at one is an error, and so is to mix it with another device."""
+    """On the meta device, reading a number or mixing devices is an error."""
 
     @pytest.fixture
     def env(self, as_on_gpu):
@@ -250,7 +250,7 @@ class TestEverythingIsOnOneDevice:
 
     @pytest.fixture
     def simple_learner(self, monkeypatch):
-        """There is no fused Adam, and TorchRL compares addresses."""
+        """The meta device has no fused Adam, and TorchRL compares addresses."""
         monkeypatch.setattr(torch.optim, "Adam", lambda parameters, **_: torch.optim.SGD(parameters))
         monkeypatch.setattr(learner_module, "SoftUpdate", lambda *_, **__: None)
 
@@ -258,13 +258,13 @@ class TestEverythingIsOnOneDevice:
     def devices(td):
         return {value.device.type for value in td.values(True, True)}
 
-    def test_worlds(self, env):
+    def test_all_entries_of_the_worlds_are_on_the_device(self, env):
         after = env._step(TensorDict(action=torch.zeros(8, dtype=torch.int64, device="meta"), batch_size=8))
         env._renew(after["done"].squeeze(-1))
         assert self.devices(after) == {part.device.type for part in (*env.state, env.steps)} == {"meta"}
         assert self.devices(env._reset(None)) == {"meta"}
 
-    def test_option_book(self):
+    def test_all_entries_of_the_option_book_are_on_the_device(self):
         env = subgoal_env(8, wrong_subgoal_reward=-0.5, max_option_steps=3)
         td = env.rand_action(env.reset()).to("meta")
         after = env.transform[1]._step(td, env.step(env.rand_action(env.reset()))["next"].to("meta"))
@@ -274,7 +274,7 @@ class TestEverythingIsOnOneDevice:
 
     @pytest.mark.parametrize("network", [compact_network(8, (8,)), paper_network(8)], ids=["compact", "paper"])
     @pytest.mark.parametrize("name", EVERY)
-    def test_policy_and_loss(self, name, network, env, simple_learner):
+    def test_all_entries_of_policy_and_loss_are_on_the_device(self, name, network, env, simple_learner):
         ladder = EpsilonGreedy(ladder=1.0)
         parts = {"exploration": ladder} if name in FLAT else {"meta_exploration": ladder}
         (real, real_env), (algorithm, _) = make(name), make(name, env, architecture=network, **parts)
@@ -293,13 +293,13 @@ class TestEverythingIsOnOneDevice:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 class TestOnAGPU:
-    def test_a_window_is_the_cpus_value_for_value(self):
+    def test_a_window_equals_that_of_a_cpu(self):
         for shape, size in (((16, 70, 70, 3), 44), ((2, 210, 160, 3), 44), ((3, 30, 33, 1), 84)):
             screens = torch.randint(256, shape, dtype=torch.uint8)
             assert torch.equal(resized(screens.cuda(), size).cpu(), resized(screens, size))
 
     @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
-    def test_an_evaluation_leaves_its_random_numbers_alone(self, kind):
+    def test_an_evaluation_leaves_random_numbers_of_the_gpu_alone(self, kind):
         env = small_env(8, device="cuda")
         algorithm = build("v3", env)
         torch.cuda.manual_seed(5)
@@ -310,7 +310,7 @@ class TestOnAGPU:
         assert torch.equal(torch.cuda.get_rng_state(), state) and results[0] == results[1]
 
     @pytest.mark.parametrize("name", EVERY)
-    def test_it_trains(self, name):
+    def test_a_training_on_a_gpu_runs(self, name):
         algorithm, env = make(name, small_env(8, max_steps=5, obstacle="teleport", device="cuda"))
         for batch in collect(algorithm, env, 10, batches=2):
             for learner in algorithm.learners.values():
@@ -318,10 +318,10 @@ class TestOnAGPU:
                 assert learner.learn()["loss"].isfinite()
 
 
-class TestWhatLivesOnTheHost:
-    """A checkpoint is loaded with all of its tensors on the GPU; what works on the host takes its own back."""
+class TestStateOnTheHost:
+    """Checkpoints are loaded with all tensors on the GPU; parts that work on the host move theirs back."""
 
-    def test_the_stand_in_is_as_awkward_as_a_gpu(self):
+    def test_the_stand_in_behaves_like_a_gpu_tensor(self):
         there = elsewhere({"a": [torch.arange(3)]})["a"][0]
         with pytest.raises(TypeError, match="to numpy"):
             there.numpy()
@@ -329,7 +329,7 @@ class TestWhatLivesOnTheHost:
             there + torch.arange(3)
         assert (there + 1).cpu().numpy().tolist() == [1, 2, 3]
 
-    def test_legs(self):
+    def test_legs_can_be_restored(self):
         algorithm, env = make("v2")
         batches = collect(algorithm, env, 6, batches=2)
         legs, other = LegCounter(2), LegCounter(2)
@@ -339,7 +339,7 @@ class TestWhatLivesOnTheHost:
             each.observe(batches[1])
         assert torch.equal(other.options, legs.options) and legs.options.sum() > 20
 
-    def test_priorities(self):
+    def test_priorities_can_be_restored(self):
         env = small_env(8)
         algorithm = build("drqn", env, settings=tiny_settings(priority_exponent=0.9))
         learner = algorithm.learners["flat"]
@@ -352,7 +352,7 @@ class TestWhatLivesOnTheHost:
             assert torch.equal(sampler.state_dict()[name], state[name])
         learner.learn()
 
-    def test_emulators(self):
+    def test_emulators_can_be_restored(self):
         pytest.importorskip("ale_py")
         env, other = (MontezumaEnv(2, seed=seed, practice=0.5) for seed in (0, 1))
         env.rollout(3)

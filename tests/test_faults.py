@@ -1,4 +1,4 @@
-"""Killed processes, full disks, numbers that are none: a training loses little and says what happened."""
+"""Killed processes, full disks, NaN and infinity: a training loses little and reports what happened."""
 
 import os
 import random
@@ -23,7 +23,7 @@ INTERVAL = 32  # frames: every batch is saved
 
 @dataclass
 class Kill:
-    """What one ``kill -9`` met and what it cost."""
+    """What one ``kill -9`` interrupted and what it cost."""
 
     in_write: bool
     frames_lost: int
@@ -48,7 +48,7 @@ class Campaign:
         self.folder, self.random, self.kills = folder, random.Random(seed), list[Kill]()
 
     def run(self, name: str, seed: int, **settings) -> None:
-        """One training to its end, compared with one that nobody killed."""
+        """Runs one training to its end and compares it with an uninterrupted one."""
         settings |= {"checkpoint_frames": INTERVAL}
         folder, reference = self.folder / f"{name}-{seed}", self.folder / f"{name}-{seed}-uninterrupted"
         folder.mkdir()
@@ -69,7 +69,7 @@ class Campaign:
         check_same(folder, reference)
 
     def kill_some_time(self, process, folder: Path, diary: Diary, known: int) -> None:
-        """Kills a process, unless it is done before."""
+        """Kills a process, unless it has finished."""
         count, in_write = self.random.randint(1, 2), self.random.random() < 0.5
         events, size = [], 0
         while process.is_alive():
@@ -86,7 +86,7 @@ class Campaign:
                 return
 
     def judge(self, notes: list[dict], known: int, killed_at: float | None) -> None:
-        """Where the last start went on, compared with where the process before it was killed."""
+        """Compares where the last start continued with where the process before it was killed."""
         began = next((note for note in notes[known:] if note["event"] == "start"), None)
         assert began is not None, "killed before it began"
         assert began["left"] == 0
@@ -120,7 +120,7 @@ class Campaign:
         )
 
 
-def test_killed_at_any_moment_it_loses_nothing_but_the_last_interval(tmp_path):
+def test_a_training_killed_at_any_moment_loses_only_the_last_interval(tmp_path):
     campaign = Campaign(tmp_path, seed=0)
     campaign.run("v2", seed=0, total_frames=320)
     print(campaign)
@@ -128,7 +128,7 @@ def test_killed_at_any_moment_it_loses_nothing_but_the_last_interval(tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_two_hundred_times(tmp_path):
+def test_a_training_killed_two_hundred_times_loses_only_the_last_intervals(tmp_path):
     campaign, seed = Campaign(tmp_path, seed=1), 0
     while len(campaign.kills) < 200:
         campaign.run(("v2", "v3", "v1", "drqn")[seed % 4], seed, total_frames=1024)
@@ -147,10 +147,10 @@ def uninterrupted(tmp_path_factory):
 
 
 class TestFullDisk:
-    """A limit of the kernel for the size of files; it refuses a write as a full disk does."""
+    """The kernel's limit on file sizes stands in for a full disk: writes beyond it fail in the same way."""
 
     @pytest.mark.parametrize("size", [0, 100, 3_000, 9_000, 20_000], ids="files of {} bytes".format)
-    def test_the_checkpoint_before_is_kept_and_named_and_training_goes_on_from_it(self, tmp_path, uninterrupted, size):
+    def test_a_full_disk_keeps_the_previous_checkpoint_which_can_be_resumed(self, tmp_path, uninterrupted, size):
         """Text, small and large tensors fail, one after the other."""
         seed_everything(0)
         trainer = make_training(tmp_path, checkpoint_frames=96)
@@ -178,7 +178,7 @@ class TestFullDisk:
         trainer.train()
         check_same(tmp_path, uninterrupted)
 
-    def test_before_the_first_checkpoint_there_is_none_to_name(self, tmp_path):
+    def test_on_a_full_disk_before_the_first_checkpoint_the_error_names_none(self, tmp_path):
         trainer = make_training(tmp_path, checkpoint_frames=32)
         trainer.logger.log = lambda row: None  # the table would not fit either
         with (
@@ -188,7 +188,7 @@ class TestFullDisk:
             trainer.train()
         assert not list((tmp_path / "checkpoints").iterdir())
 
-    def test_half_a_row_of_metrics_is_mended(self, tmp_path, uninterrupted):
+    def test_half_a_row_of_metrics_is_removed_on_resume(self, tmp_path, uninterrupted):
         seed_everything(0)
         trainer = make_training(tmp_path, checkpoint_frames=32)
         log, metrics = trainer.logger.log, tmp_path / "metrics.csv"
@@ -211,14 +211,14 @@ class TestFullDisk:
 
 
 class TestUnwritableFolder:
-    def test_a_file_in_its_place(self, tmp_path):
+    def test_a_file_in_place_of_the_checkpoints_folder_is_reported(self, tmp_path):
         (tmp_path / "checkpoints").write_text("mine")
         with pytest.raises(CheckpointError, match="checkpoints must be what a run leaves there, got a file;"):
             make_training(tmp_path, checkpoint_frames=32).train()
         assert (tmp_path / "checkpoints").read_text() == "mine"
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-    def test_no_permission(self, tmp_path):
+    def test_a_folder_without_write_permission_is_reported(self, tmp_path):
         trainer = make_training(tmp_path, checkpoint_frames=96)
         before(trainer, 192, lambda: (tmp_path / "checkpoints").chmod(0o500))
         with pytest.raises(CheckpointError, match=r"Permission denied.*the last good checkpoint is .*000096"):
@@ -228,7 +228,7 @@ class TestUnwritableFolder:
 
 
 def before(trainer, frames, action):
-    """``action`` comes before the updates after the batch that ends at ``frames``."""
+    """Calls ``action`` after the batch that ends at ``frames``, before the updates."""
     learner = next(iter(trainer.algorithm.learners.values()))
     store = learner.store
 
@@ -240,8 +240,8 @@ def before(trainer, frames, action):
     learner.store = acting
 
 
-class TestNumbersThatAreNone:
-    """Training stops before the optimiser's step, and says where and what to go back to."""
+class TestNanAndInfinity:
+    """Training stops before the optimiser's step, and reports where, and the last good checkpoint."""
 
     def stopped(self, folder, poison):
         """The message, after ``poison(trainer)`` at 192 frames, and the last good checkpoint."""
@@ -255,7 +255,7 @@ class TestNumbersThatAreNone:
         return str(error.value), max((folder / "checkpoints").iterdir())
 
     @pytest.mark.parametrize("level", ["sub", "meta"])
-    def test_a_weight_and_so_a_loss(self, tmp_path, level):
+    def test_a_weight_that_is_not_finite_stops_training(self, tmp_path, level):
         def poison(trainer):
             learner = trainer.algorithm.learners[level]
             sample = learner.sample
@@ -274,7 +274,7 @@ class TestNumbersThatAreNone:
         )
         assert re.fullmatch(f"{level}: {what} {where} {good}\\.", told) and good.name.endswith("096")
 
-    def test_a_gradient(self, tmp_path):
+    def test_a_gradient_that_is_not_finite_stops_training(self, tmp_path):
         def poison(trainer):
             parameters = dict(trainer.algorithm.learners["meta"].network.named_parameters())
             parameters["network.memory.bias_hh_l0"].register_hook(lambda gradient: gradient / 0)
@@ -287,7 +287,7 @@ class TestNumbersThatAreNone:
 
     @pytest.mark.parametrize("key", ["reward", "extrinsic_reward"])
     @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-    def test_a_reward(self, tmp_path, key, value):
+    def test_a_reward_that_is_not_finite_stops_training(self, tmp_path, key, value):
         def poison(trainer):
             env = trainer.collector.env.base_env
             step = env._step
@@ -304,8 +304,8 @@ class TestNumbersThatAreNone:
             f"next.{key} holds a NaN or an infinity, environment 2, after frame 192; training stopped"
         )
 
-    def test_an_observation(self, tmp_path):
-        """Seen by a policy whose weights are whole: the environment is at fault."""
+    def test_an_observation_that_is_not_finite_stops_training(self, tmp_path):
+        """The policy's weights are finite, so the environment is at fault."""
 
         def poison(trainer):
             collector = trainer.collector
@@ -325,7 +325,7 @@ class TestNumbersThatAreNone:
         )
         assert told.endswith(f"the last good checkpoint is {good}.")
 
-    def test_before_the_first_checkpoint(self, tmp_path):
+    def test_the_error_before_the_first_checkpoint_names_none(self, tmp_path):
         trainer = make_training(tmp_path)
         before(
             trainer, 96, lambda: next(trainer.algorithm.learners["sub"].network.parameters()).data.fill_(float("nan"))
@@ -333,7 +333,7 @@ class TestNumbersThatAreNone:
         with pytest.raises(NonFiniteError, match=r"update 1, frame 96; .*; there is no earlier checkpoint\.$"):
             trainer.train()
 
-    def test_what_was_saved_before_is_good(self, tmp_path, uninterrupted):
+    def test_checkpoints_saved_before_the_error_can_be_loaded(self, tmp_path, uninterrupted):
         seed_everything(0)
         trainer = make_training(tmp_path, checkpoint_frames=96)
         before(

@@ -1,4 +1,4 @@
-"""Run folders from somebody who means harm: each ends at once, in a sentence, and nothing outside is touched."""
+"""Malicious run folders: programs refuse each at once with a clear error and touch nothing outside."""
 
 import json
 import os
@@ -42,7 +42,7 @@ def valid(tmp_path_factory):
 
 @pytest.fixture
 def run(valid, tmp_path, monkeypatch):
-    """A copy of it; beside it lies what must stay as it is."""
+    """A copy of the run, next to files that must not change."""
     outside = tmp_path / "outside"
     (outside / "checkpoint-000000000001").mkdir(parents=True)
     (outside / "checkpoint-000000000001" / "file").write_text("precious")
@@ -61,7 +61,7 @@ def snapshot(folder):
 
 @contextmanager
 def at_once(seconds=5):
-    """Interrupts what hangs, and fails what takes longer."""
+    """Interrupts code that hangs, and fails if it takes too long."""
 
     def give_up(*_):
         raise AssertionError("it hangs")
@@ -198,7 +198,7 @@ def text(name, content):
 
 
 def in_checkpoints(attack_of):
-    """The same to every checkpoint."""
+    """Applies the same change to every checkpoint."""
     return lambda run: [attack_of(str(path.relative_to(run)))(run) for path in (run / "checkpoints").iterdir()]
 
 
@@ -224,7 +224,7 @@ def header(length, content=b""):
 
 
 def first(name_part):
-    """The stored tensor whose name ends so."""
+    """The stored tensor whose name ends like this."""
     return lambda stored: next(name for name in sorted(stored) if name.endswith(name_part))
 
 
@@ -325,7 +325,7 @@ ATTACKS = {
     [(name, reader) for name, (_, readers) in ATTACKS.items() for reader in readers],
 )
 @pytest.mark.filterwarnings("ignore:.*passed over")
-def test_it_ends_at_once_in_a_sentence(run, capsys, name, reader):
+def test_programs_refuse_a_hostile_run_in_one_sentence(run, capsys, name, reader):
     ATTACKS[name][0](run)
     with at_once(), pytest.raises((SettingsError, RunError, CheckpointError)) as refusal:
         READERS[reader](run)
@@ -333,13 +333,13 @@ def test_it_ends_at_once_in_a_sentence(run, capsys, name, reader):
     assert "Traceback" not in told and str(refusal.value).count("\n") == 0 and len(str(refusal.value)) > 20
 
 
-def test_the_run_itself_is_fine(run):
+def test_programs_accept_the_run_before_it_is_changed(run):
     for reader in READERS.values():
         reader(run)
 
 
 @pytest.mark.parametrize("name", ["error.txt", "curves.png", "metrics.partial.csv"])
-def test_what_is_in_the_way_of_a_training_is_told_or_replaced(run, name):
+def test_obstacles_to_a_training_are_reported_or_replaced(run, name):
     link(name, "precious.csv")(run)
     try:
         resumed(run)
@@ -347,14 +347,14 @@ def test_what_is_in_the_way_of_a_training_is_told_or_replaced(run, name):
         assert "symbolic link" in str(error)
 
 
-def test_a_label_that_is_no_mathematics_is_drawn_as_it_stands(run):
+def test_a_label_with_broken_mathtext_is_drawn_as_plain_text(run):
     settings(env__layout="$\\frac{$")(run)
     with at_once(30):
         plot.run(plot.Settings(runs=str(run), out=str(run.parent / "figure.png"), by="env.layout"))
         plot.run(plot.Settings(runs=str(run), out=str(run.parent / "bars.png"), by="env.layout", kind="bars"))
 
 
-def test_folders_that_lead_round_are_walked_through_once(run):
+def test_folders_with_circular_links_are_visited_once(run):
     for name in ("a", "b", "c"):
         (run / name).symlink_to(run)
     with at_once(10):
@@ -391,7 +391,7 @@ def archive_of(members, path):
     ],
     ids=lambda members: str(list(members))[:30],
 )
-def test_an_archive_holds_files_of_runs_and_nothing_else(run, monkeypatch, members):
+def test_an_archive_holds_only_files_of_runs(run, monkeypatch, members):
     monkeypatch.setattr(archives, "LARGEST_ARCHIVE", 2 << 20)
     path = archive_of(members, run.parent / "runs.tar.xz")
     with (
@@ -402,7 +402,7 @@ def test_an_archive_holds_files_of_runs_and_nothing_else(run, monkeypatch, membe
         findings.read_runs([str(path)], stack)
 
 
-def test_an_archive_of_no_archive(run):
+def test_a_file_that_is_no_archive_is_refused(run):
     (run.parent / "runs.tar.xz").write_bytes(b"text")
     with ExitStack() as stack, pytest.raises(SettingsError, match="readable archives"):
         findings.read_runs([str(run.parent / "runs.tar.xz")], stack)

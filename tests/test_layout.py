@@ -1,4 +1,4 @@
-"""The order of the package's parts: imports inside it go downwards only."""
+"""The order of the package's parts: each imports only from earlier ones."""
 
 import ast
 from pathlib import Path
@@ -31,7 +31,7 @@ def part_of(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_file_imports_only_from_its_own_part_and_those_before(path):
+def test_a_file_imports_only_from_its_own_part_and_earlier_ones(path):
     rank = ORDER.index(part_of(path))
     used = {name.split(".")[1] for name in imports_of(path) if name.startswith("hdrqn_torchrl.")} - {"__version__"}
     assert {part for part in used if ORDER.index(part) > rank} == set()
@@ -44,12 +44,12 @@ def test_only_the_programs_import_hydra(path):
     assert not {name.split(".")[0] for name in imports_of(path)} & {"hydra", "omegaconf"}
 
 
-def test_every_part_has_its_place():
+def test_every_part_of_the_package_has_a_place_in_the_order():
     assert {part_of(path) for path in FILES} == set(ORDER)
 
 
 def texts_of(path):
-    """All texts in a file's code, and those at the end of a path; docstrings are none."""
+    """All strings in a file's code without docstrings, and the last parts of paths."""
     tree = ast.parse(path.read_text())
     docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     return {

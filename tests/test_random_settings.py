@@ -1,4 +1,4 @@
-"""Random settings: whatever is asked for either trains or is refused with key, rule and value; no traceback, no NaN."""
+"""Random settings either train, without NaN, or are refused with key, rule and value, without traceback."""
 
 import csv
 import json
@@ -45,7 +45,7 @@ def composed(env, algo, network):
 
 
 def leaves(node, path=""):
-    """Full names of all settings; of parts with settings of their own, too."""
+    """Full names of all settings, including those of parts that have settings themselves."""
     for key in node:
         name = f"{path}{key}"
         if name.partition(".")[0] in (*ELSEWHERE, "hydra"):
@@ -67,7 +67,7 @@ WORDS = {
 
 
 def plausible(config, key, dice):
-    """A value that could be meant."""
+    """A plausible value."""
     value = OmegaConf.select(config, key)
     if (name := key.rpartition(".")[2]) in WORDS:
         return dice.choice(WORDS[name])
@@ -129,7 +129,7 @@ def refused(number, folder, run):
 
 
 def check_message(number, told):
-    """It names a setting that was given, or one below or above it, and is about more than a type of Python's."""
+    """The message names a setting that was given (or its parent or child), and says more than a Python type."""
     _, overrides = draw(number)
     keys = [override.lstrip("+").partition("=")[0] for override in overrides]
     named = [key for key in keys if key in told or key.rpartition(".")[0] in told or "logger.loggers" in told]
@@ -138,7 +138,7 @@ def check_message(number, told):
 
 
 def check_trains(number, folder):
-    """Two rows at least, in each of which every cell is a finite number or empty."""
+    """There are at least two rows, and every cell is a finite number or empty."""
     told = refused(number, folder, train.train)
     if told is not None:
         check_message(number, told)
@@ -158,20 +158,20 @@ def check_builds(number, folder):
 
 
 @pytest.mark.parametrize("first", range(0, 300, 50))
-def test_300_configurations_are_built_or_refused_in_words(first, tmp_path):
+def test_300_random_configurations_are_built_or_refused_with_a_clear_error(first, tmp_path):
     told = [check_builds(number, tmp_path / str(number)) for number in range(first, first + 50)]
     assert 10 < told.count(None) < 40
 
 
 @pytest.mark.parametrize("number", range(1, 101, 10))
-def test_ten_of_them_train(number, tmp_path, monkeypatch):
+def test_ten_random_configurations_train(number, tmp_path, monkeypatch):
     monkeypatch.setattr("hdrqn_torchrl.analysis.plotting.plot_run", lambda _, path, **settings: path.touch())
     check_trains(number, tmp_path / "run")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", range(1_000, 2_000, 50))
-def test_many_train_or_are_refused_in_words(first, tmp_path, monkeypatch):
+def test_many_random_configurations_train_or_are_refused_with_a_clear_error(first, tmp_path, monkeypatch):
     monkeypatch.setattr("hdrqn_torchrl.analysis.plotting.plot_run", lambda _, path, **settings: path.touch())
     for number in range(first, first + 50):
         check_trains(number, tmp_path / str(number))
@@ -193,6 +193,6 @@ def test_many_train_or_are_refused_in_words(first, tmp_path, monkeypatch):
         ("algo.sub.tau=nan", "algo.sub.tau must be a number, got nan"),
     ],
 )
-def test_what_ended_in_a_traceback_or_named_no_setting(override, rule, tmp_path):
+def test_settings_that_used_to_end_in_a_traceback_are_refused_by_name(override, rule, tmp_path):
     parts = ("gridworld", "v2", "compact")
     assert rule in refused((parts, [override]), tmp_path / "run", train.build_run)

@@ -1,4 +1,4 @@
-"""A training that was stopped and resumed is, bit for bit, the one that was not."""
+"""A training that was stopped and resumed equals an uninterrupted one bit for bit."""
 
 import os
 import random
@@ -62,7 +62,7 @@ class Cut:
     holds: Callable  # checks, on the stopped trainer, that the cut is what its name says
 
     def arm(self, trainer, action=partial(signal.raise_signal, signal.SIGTERM)):  # noqa: B008
-        """``action`` happens once."""
+        """Calls ``action`` once."""
         owner, name = self.method(trainer)
         method = getattr(owner, name)
 
@@ -110,7 +110,7 @@ def at(trainer, *, batch, rows, updates_each):
 
 
 def owed(trainer, *, number, dues):
-    """Updates that are left of the iteration, and the minibatches that were drawn for them."""
+    """Updates that remain in the iteration, and the minibatches already drawn for them."""
     left = tuple(learner.updates_due() for learner in trainer.algorithm.learners.values())
     assert left[:2] == (dues if len(left) > 1 else (dues[number],))
     assert level(trainer, number).state_dict()["drawn"]
@@ -128,7 +128,7 @@ def options_in_progress(trainer):
 
 
 def memories_wrapped(trainer):
-    """Every replay memory is full and was written over from its beginning on."""
+    """Every replay memory is full and has wrapped around."""
     for learner in trainer.algorithm.learners.values():
         assert learner.buffer.is_full()
         assert 0 < learner.buffer.state_dict()["_writer"]["_cursor"] < len(learner.buffer.storage[:])
@@ -150,7 +150,7 @@ CUTS = {
 
 @pytest.fixture(scope="module", autouse=True)
 def memory_for_disk():
-    """What is tested here does not depend on fsync, which takes most of the time of a small checkpoint."""
+    """Skips fsync, which takes most of the time of a small checkpoint and does not matter here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda _: None)
         yield
@@ -167,7 +167,7 @@ PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2
 
 @pytest.fixture(scope="module")
 def prepare(tmp_path_factory):
-    """Trains once without a stop and once with all of them."""
+    """Trains once without stops and once with all of them."""
 
     @cache
     def prepare(name):
@@ -195,7 +195,7 @@ def training(request, prepare):
 
 
 def resume(build, folder, **settings):
-    """A new training, with nothing in common with the stopped one, that goes on from its newest checkpoint."""
+    """A new training with other seeds that continues from the stopped one's newest checkpoint."""
     seed_everything(99)
     trainer = build(folder, seed=99, **settings)
     trainer.resume(trainer.checkpoints.newest())
@@ -203,7 +203,7 @@ def resume(build, folder, **settings):
 
 
 @pytest.mark.parametrize(("training", "name"), PAIRS, indirect=["training"])
-def test_a_stopped_training_goes_on_as_if_nothing_had_happened(training, name, tmp_path):
+def test_a_stopped_and_resumed_training_equals_an_uninterrupted_one(training, name, tmp_path):
     build, folder = training
     shutil.copytree(folder / name, tmp_path, dirs_exist_ok=True)
     trainer = resume(build, tmp_path)
@@ -217,13 +217,13 @@ only_v2 = pytest.mark.parametrize("training", ["v2"], indirect=True)
 
 
 @only_v2
-def test_one_that_goes_on_in_the_same_process(training):
+def test_a_training_resumed_in_the_same_process_equals_an_uninterrupted_one(training):
     _, folder = training
     check_same(folder / "run", folder / "uninterrupted")
 
 
 @only_v2
-def test_one_that_is_stopped_again_and_again(training, tmp_path):
+def test_a_training_stopped_many_times_equals_an_uninterrupted_one(training, tmp_path):
     build, folder = training
     shutil.copytree(folder / "in the first evaluation", tmp_path, dirs_exist_ok=True)
     for name in ("between two updates", "between two updates of the other level", "with full memories"):
@@ -236,7 +236,7 @@ def test_one_that_is_stopped_again_and_again(training, tmp_path):
 
 
 def stop_after(trainer, moments):
-    """A stop request once the trainer has looked for one so many times: before updates and after iterations."""
+    """Requests a stop at the given number of the trainer's checks, which come before updates and after iterations."""
     check = trainer._stop.check
 
     def counting():
@@ -251,7 +251,7 @@ def stop_after(trainer, moments):
 
 @pytest.mark.parametrize("training", ["v2-odd", "v3-r2d2"], indirect=True)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_one_that_is_cut_at_random_moments(training, seed, tmp_path):
+def test_a_training_stopped_at_random_moments_equals_an_uninterrupted_one(training, seed, tmp_path):
     build, folder = training
     generator, cuts, wrapped = random.Random(seed), 0, 0
     shutil.copytree(folder / "in the first evaluation", tmp_path, dirs_exist_ok=True)
@@ -270,7 +270,7 @@ def test_one_that_is_cut_at_random_moments(training, seed, tmp_path):
 
 
 @only_v2
-def test_one_that_crashed_does_again_what_came_after_its_checkpoint(training, tmp_path):
+def test_a_crashed_training_repeats_what_came_after_its_checkpoint(training, tmp_path):
     def crash():
         raise RuntimeError("crash")
 
@@ -288,7 +288,7 @@ def test_one_that_crashed_does_again_what_came_after_its_checkpoint(training, tm
 
 
 @pytest.mark.parametrize("training", ["drqn", "v2"], indirect=True)
-def test_one_that_had_ended_goes_on_when_total_frames_are_raised(training, tmp_path):
+def test_a_finished_training_continues_when_total_frames_is_raised(training, tmp_path):
     build, folder = training
     shutil.copytree(folder / "between two updates", tmp_path, dirs_exist_ok=True)
     resume(build, tmp_path, total_frames=128).train()
@@ -299,7 +299,7 @@ def test_one_that_had_ended_goes_on_when_total_frames_are_raised(training, tmp_p
 
 
 @only_v2
-def test_one_that_had_ended_stays_as_it_is(training, tmp_path):
+def test_resuming_a_finished_training_changes_nothing(training, tmp_path):
     build, folder = training
     shutil.copytree(folder / "uninterrupted", tmp_path, dirs_exist_ok=True)
     resume(build, tmp_path).train()
@@ -307,8 +307,8 @@ def test_one_that_had_ended_stays_as_it_is(training, tmp_path):
 
 
 @pytest.mark.parametrize("training", ["v1-r2d2", "v2", "v3"], indirect=True)
-def test_one_without_its_memories_goes_on_with_empty_ones(training, tmp_path):
-    """Networks, optimisers, counters and worlds are as they were; updates wait for the warm-up, and are not made up."""
+def test_a_checkpoint_without_memories_resumes_with_empty_ones(training, tmp_path):
+    """Networks, optimisers, counters and worlds are restored; updates wait for the warm-up and are not made up for."""
     build, folder = training
     shutil.copytree(folder / "with full memories", tmp_path, dirs_exist_ok=True)
     trainer = resume(build, tmp_path, checkpoints=Checkpoints(tmp_path / "checkpoints", replay=False))

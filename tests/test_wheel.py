@@ -1,4 +1,4 @@
-"""The package as others get it: a wheel in an environment of its own, without the checkout."""
+"""The package as users get it: a wheel in a separate environment, without the checkout."""
 
 import json
 import os
@@ -27,7 +27,7 @@ def watch(event, arguments):
 notes = os.open(os.path.join(sys.prefix, "read.txt"), os.O_WRONLY | os.O_APPEND | os.O_CREAT)
 sys.addaudithook(watch)
 """
-"""Notes every file of the checkout that a process opens."""
+"""Records every file of the checkout that a process opens."""
 
 
 def run(*command, folder):
@@ -38,7 +38,7 @@ def run(*command, folder):
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory):
-    """A virtual environment inside somebody's git repository, with the wheel and this environment's dependencies."""
+    """A virtual environment inside another git repository, with the wheel and this environment's dependencies."""
     folder = tmp_path_factory.mktemp("elsewhere")
     source, environment = folder / "source", folder / "environment"
     source.mkdir()
@@ -64,7 +64,7 @@ def installed(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def trained(installed):
-    """A run of 2,000 frames with a configuration folder of one's own, and what the program said."""
+    """A run of 2,000 frames with a custom configuration folder, and the program's output."""
     folder = installed.parent / "work"
     mine = folder / "mine" / "algo"
     mine.mkdir(parents=True)
@@ -84,17 +84,17 @@ def test_the_installed_command_trains(trained):
 
 
 @pytest.mark.slow
-def test_a_configuration_folder_of_ones_own_is_used(trained):
+def test_the_installed_command_uses_a_custom_configuration_folder(trained):
     assert "gamma: 0.75" in (trained[0] / "config.yaml").read_text()
 
 
 @pytest.mark.slow
-def test_a_commit_of_the_repository_that_the_environment_lies_in_is_not_taken_for_its_own(trained):
+def test_the_commit_of_an_enclosing_repository_is_not_recorded(trained):
     assert json.loads((trained[0] / "run.json").read_text())["commit"] is None
 
 
 @pytest.mark.slow
-def test_the_run_evaluates_and_nothing_was_read_from_the_checkout(trained, installed):
+def test_the_installed_command_evaluates_without_the_checkout(trained, installed):
     done = run(str(installed / "bin" / "hdrqn"), "evaluate", "run=run", "episodes=8", folder=trained[0].parent)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["episodes"] == 8
@@ -102,12 +102,12 @@ def test_the_run_evaluates_and_nothing_was_read_from_the_checkout(trained, insta
 
 
 @pytest.mark.slow
-def test_a_refused_setting_is_told_with_what_to_type(installed):
+def test_errors_of_the_installed_command_say_what_to_type(installed):
     refused = run(str(installed / "bin" / "hdrqn"), "train", "algo.gamma=high", folder=installed)
     assert refused.returncode == 1 and "`hdrqn train --cfg job` shows every setting" in refused.stderr
 
 
-def test_the_installed_command_tells_version_and_programs(installed):
+def test_the_installed_command_prints_version_and_programs(installed):
     hdrqn = str(installed / "bin" / "hdrqn")
     assert run(hdrqn, "--version", folder=installed).stdout == f"{hdrqn_torchrl.__version__}\n"
     assert "train|evaluate|watch|plot|report" in run(hdrqn, "--help", folder=installed).stdout

@@ -1,4 +1,4 @@
-"""Finds, on a CPU, operations for which a GPU would make the host wait."""
+"""Finds, on a CPU, operations that would make the host wait for a GPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _TO_DEVICE = {"tensor", "as_tensor", "new_tensor"}  # of numbers: copied from th
 
 
 class HostWaits(TorchDispatchMode):
-    """Collects in ``found`` each such operation, with the place in the package that asked for it.
+    """Collects each such operation in ``found``, with the place in the package that called it.
 
     Args:
         package: where to look for the place.

@@ -1,4 +1,4 @@
-"""Agents of one, two and three levels on one task: who chooses when, what is learned, that nothing is lost."""
+"""Agents of one, two and three levels on the same task: when each level chooses, and what it learns."""
 
 import pytest
 import torch
@@ -33,7 +33,7 @@ def test_levels_are_named_after_what_they_choose_among():
 
 
 @pytest.mark.parametrize(("levels", "names"), [(1, ["sub"]), (2, ["sub", "meta"]), (3, ["sub", "rooms", "meta"])])
-def test_one_argument_makes_a_level(levels, names):
+def test_levels_decides_how_many_levels_learn(levels, names):
     env = house(6, max_steps=12)
     algorithm = agent(env, levels)
     assert list(algorithm.explorations) == names
@@ -48,20 +48,20 @@ def test_one_argument_makes_a_level(levels, names):
     assert all((old != new).any() for old, new in zip(before, algorithm.policy.parameters(), strict=True))
 
 
-def test_a_task_with_fewer_sets_of_subgoals_is_refused():
+def test_more_levels_than_the_task_has_sets_for_are_refused():
     for env, most in ((house(), 3), (MultiGoalGridEnv(4), 2)):
         with pytest.raises(ValueError, match=rf"levels must lie in \[1, {most}\], got {most + 1}: the task states"):
             agent(env, most + 1)
 
 
-def test_a_bonus_is_for_flat_agents():
+def test_bonus_reward_is_refused_for_more_than_one_level():
     with pytest.raises(ValueError, match=r"bonus_reward must be 0 with levels=2, got 0\.5; their critic"):
         agent(house(), 2, bonus_reward=0.5)
     assert agent(house(), 1, bonus_reward=0.5).learners["joint"].loss.rules[0].largest_return == float("inf")
 
 
 class TestThreeLevels:
-    """Against a book kept by hand, on play half at random."""
+    """Compared with an option book written out by hand, on half-random play."""
 
     @pytest.fixture
     def played(self):
@@ -75,8 +75,8 @@ class TestThreeLevels:
         del policy.network.step
         return batch
 
-    def test_who_chooses_when(self, played):
-        """The far level where its option ended, the near one there, too, and where its own ended; elsewhere nobody."""
+    def test_a_level_chooses_when_its_option_or_the_one_above_ends(self, played):
+        """The far level chooses where its option ended; the near one also where its own ended."""
         for env in range(len(played)):
             far_due = near_due = True
             far = near = near_steps = None
@@ -99,7 +99,7 @@ class TestThreeLevels:
         assert (near_ends & ~far_ends).sum() > 20 and far_ends.sum() > 10
         assert (far_ends & ~played["next", "rooms_attained"].any(-1, keepdim=True)).any()
 
-    def test_each_level_chooses_for_what_the_one_above_pursues(self, played):
+    def test_each_level_chooses_by_its_values_for_the_subgoal_above(self, played):
         values = [torch.stack(level, 1) for level in zip(*(values for values, _ in self.acted_by), strict=True)]
         assert [value.shape[2:] for value in values] == [(3, 4), (2, 3), (1, 2)]
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -113,14 +113,14 @@ class TestThreeLevels:
         for_near = values[0][:, 0].gather(1, near.view(-1, 1, 1).expand(-1, 1, 4)).squeeze(1)
         assert (greedy["action"] == for_near.argmax(-1)).all()
 
-    def test_acting_and_learning_agree(self, played):
+    def test_acting_and_learning_compute_the_same_values(self, played):
         with set_recurrent_mode(True), torch.no_grad():
             learned = self.algorithm.policy(played.clone())
         acted = [torch.stack(level, 1) for level in zip(*(values for values, _ in self.acted_by), strict=True)]
         for key, value in zip(("action_value", "rooms_subgoal_value", "subgoal_value"), acted, strict=True):
             torch.testing.assert_close(learned[key], value, rtol=0, atol=1e-6)
 
-    def test_a_near_option_collects_what_the_far_one_is_paid(self, played):
+    def test_a_near_option_collects_the_intrinsic_reward_of_the_far_one(self, played):
         paid, collected = played["next", "intrinsic_reward"], played["next", "rooms_option_return"]
         for env in range(len(played)):
             total, steps = 0.0, 0

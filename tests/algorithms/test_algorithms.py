@@ -84,19 +84,19 @@ def test_every_algorithm_collects_and_updates_each_level(name, options, network,
     ],
     ids=["n_step", "priorities", "sub-states", "meta-states"],
 )
-def test_what_hindsight_does_not_go_with(settings, options, message):
+def test_settings_incompatible_with_hindsight_are_refused(settings, options, message):
     with pytest.raises(ValueError, match=message):
         build("v2", small_env(4), settings=tiny_settings(**settings), **options)
 
 
 @pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])
-def test_the_environment_as_the_algorithm_sees_it_keeps_its_specs(name):
+def test_the_transformed_environment_passes_check_env_specs(name):
     env = small_env(3)
     check_env_specs(build(name, env).transform(env))
 
 
 @pytest.mark.parametrize("name", [*ALGORITHMS, "v3"])
-def test_the_policy_is_made_of_what_the_learners_train(name):
+def test_the_policy_shares_its_parameters_with_the_learners(name):
     algorithm = build(name, small_env(3))
     trained = {id(p) for learner in algorithm.learners.values() for p in learner.network.parameters()}
     assert trained == {id(p) for p in algorithm.policy.parameters()}
@@ -105,12 +105,12 @@ def test_the_policy_is_made_of_what_the_learners_train(name):
 
 
 def unbounded():
-    """Settings of a learner whose targets may be any number."""
+    """Settings of a learner without bounds of targets."""
     return tiny_settings(max_target="unbounded")
 
 
 def value_everything_at(learner, value):
-    """Makes the target network's Q-values the same everywhere."""
+    """Makes all Q-values of the target network equal to ``value``."""
     streams = learner.loss.target_value_network_params["network", "head", "streams"]
     with torch.no_grad():
         for parameter in streams.values():
@@ -124,32 +124,32 @@ def learner_ends(learner):
 
 
 class TestBoundsOfTargets:
-    """Only what the task states bounds what its agents hope for."""
+    """Targets are bounded by what the task states, and by nothing else."""
 
     def bound(self, algorithm, level):
         loss = algorithm.learners[level].loss
         return loss.rules[-1].largest_return if level == "joint" else loss.max_target
 
     @pytest.mark.parametrize(("name", "level"), [("dqn", "flat"), ("drqn", "flat"), ("v1", "meta"), ("v2", "meta")])
-    def test_the_grid_states_that_a_goal_pays_one(self, name, level):
+    def test_the_grid_task_bounds_returns_by_one_per_goal(self, name, level):
         algorithm = build(name, small_env(2, num_goals=3))
         assert self.bound(algorithm, level) == 3.0
         settings = tiny_settings(max_target=0.5)
         assert self.bound(build(name, small_env(2), settings=settings), level) == 0.5
 
-    def test_the_grid_bounds_v3_on_both_sides(self):
+    def test_the_grid_task_bounds_targets_of_v3_on_both_sides(self):
         loss = build("v3", small_env(2, num_goals=3)).learners["joint"].loss
         sub, meta = loss.rules
         assert (meta.smallest_return, meta.largest_return, sub.largest_return) == (0.0, 3.0, 1.0)
         assert build("v3", small_env(2), max_meta_target=0.5).learners["joint"].loss.rules[1].largest_return == 0.5
 
     @pytest.mark.parametrize(("rewards", "bound"), [({}, 1.0), ({"wrong_subgoal_reward": 0.5}, math.inf)])
-    def test_reaching_a_subgoal_pays_one_unless_more_is_paid(self, rewards, bound):
+    def test_targets_of_the_sub_level_are_bounded_by_the_largest_intrinsic_return(self, rewards, bound):
         assert self.bound(build("v2", small_env(2), **rewards), "sub") == bound
         assert build("v3", small_env(2), **rewards).learners["joint"].loss.rules[0].largest_return == bound
 
     @pytest.mark.parametrize("name", ["dqn", "v1", "v3"])
-    def test_an_environment_that_says_nothing_is_not_bounded_by_the_name_of_an_argument(self, name):
+    def test_without_a_stated_return_targets_are_unbounded(self, name):
         level = {"dqn": "flat", "v1": "meta", "v3": "joint"}[name]
         env = Corridor(4, num_goals=2, pays=10.0, without=("success",))
         torch.manual_seed(0)
@@ -164,7 +164,7 @@ class TestBoundsOfTargets:
         value = "meta_q_value" if name == "v3" else "q_value"
         assert learner.learn()[value] > 4.0
 
-    def test_what_a_user_s_environment_states_bounds_its_agents(self):
+    def test_returns_stated_by_a_custom_environment_bound_targets(self):
         task = Task(largest_return=40.0, largest_extrinsic_return=20.0, smallest_extrinsic_return=-5.0)
         env = Corridor(4, pays=10.0, without=("success",), task=task)
         assert self.bound(build("drqn", env), "flat") == 40.0
@@ -174,25 +174,25 @@ class TestBoundsOfTargets:
 
 
 class TestSequencesOfV3:
-    """Unless it is told, v3 takes their length from the task."""
+    """By default, v3 takes their length from the task."""
 
     def settings(self, env, **changes):
         return make_v3(env, compact_network(8, (8,)), learner=replace(V3_LEARNER, **changes)).learners["joint"].settings
 
     @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
     @pytest.mark.parametrize("steps", [1, 50, 200])
-    def test_they_are_whole_episodes_of_up_to_200_steps(self, steps, sampling):
+    def test_sequences_are_whole_episodes_of_up_to_200_steps(self, steps, sampling):
         settings = self.settings(small_env(2, max_steps=steps), sampling=sampling)
         assert (settings.slice_len, settings.sampling, settings.stored_state) == (steps, sampling, False)
 
     @pytest.mark.parametrize("env", [small_env(2, max_steps=201), Corridor(2, length=6)], ids=["long", "unknown"])
-    def test_of_longer_episodes_they_are_short_and_begin_anywhere_from_stored_states(self, env):
+    def test_sequences_of_longer_episodes_are_short_and_start_from_stored_states(self, env):
         with pytest.warns(UserWarning, match=r"sequences of 32 steps that begin anywhere, .* give slice_len for"):
             settings = self.settings(env)
         assert (settings.slice_len, settings.sampling, settings.stored_state) == (32, "steps", True)
         assert settings.burn_in == 0.25
 
-    def test_what_is_given_is_kept(self):
+    def test_a_given_slice_len_is_kept(self):
         env = small_env(2, max_steps=400)
         assert self.settings(env, slice_len=50) == replace(V3_LEARNER, slice_len=50)
         given = {"sampling": "steps", "stored_state": True, "burn_in": 0.5}
@@ -202,8 +202,8 @@ class TestSequencesOfV3:
         ):
             self.settings(env, sampling="whole_episodes")
 
-    def test_of_episodes_of_400_steps_every_one_is_trained(self):
-        """Of a memory of two episodes in each environment, in step: which steps enter the loss?"""
+    def test_every_step_of_episodes_of_400_steps_is_trained(self):
+        """Counts which steps enter the loss, with a memory of two episodes in each environment."""
         env = Corridor(4, length=400, task=Task(max_steps=400))
         torch.manual_seed(0)
         settings = replace(V3_LEARNER, capacity=4 * 850, batch_size=64, warmup_frames=0)
@@ -226,7 +226,7 @@ class TestSequencesOfV3:
         assert (counts[:399] > 0).all() and counts[50:].sum() > 6 * counts[:50].sum()
 
 
-def test_the_others_need_a_number():
+def test_slice_len_must_be_a_number_except_for_v3():
     for name in ("drqn", "v1", "v2"):
         with pytest.raises(ValueError, match="slice_len must be a number, got None; only v3 asks the task"):
             build(name, small_env(2), settings=tiny_settings(slice_len=None))
@@ -242,7 +242,7 @@ class TestTasksWithoutEnd:
         ],
         ids=str,
     )
-    def test_the_meta_level_learns_from_what_happened_so_far(self, name, options):
+    def test_the_meta_level_learns_before_an_endless_episode_is_over(self, name, options):
         env = Corridor(4, length=None)
         algorithm = build(name, env, settings=tiny_settings(slice_len=2, capacity=100), max_option_steps=3, **options)
         meta = algorithm.learners["meta"]
@@ -255,7 +255,7 @@ class TestTasksWithoutEnd:
         assert len(meta.buffer) == 100 and meta.updates > 10
         assert meta.buffer.storage[:]["is_init"].sum() <= 4
 
-    def test_episodes_of_usual_length_are_stored_whole_and_others_in_pieces(self):
+    def test_only_options_of_long_or_endless_episodes_are_stored_in_pieces(self):
         held = [
             build("v2", small_env(2, max_steps=steps)).learners["meta"].extract.max_held for steps in (50, 1000, 1001)
         ]
@@ -263,7 +263,7 @@ class TestTasksWithoutEnd:
 
 
 class TestOptions:
-    """Each option changes something."""
+    """Every option has an effect."""
 
     def steps(self, batches=1, name="v2", **options):
         torch.manual_seed(0)
@@ -272,7 +272,7 @@ class TestOptions:
         batch = torch.cat(collect(algorithm, env, 30, batches), 1)
         return algorithm, batch
 
-    def test_gamma_and_smdp_discount(self):
+    def test_gamma_and_smdp_discount_reach_book_and_loss(self):
         algorithm, batch = self.steps(gamma=0.5)
         gammas = [learner.loss.gamma.item() for learner in algorithm.learners.values()]
         assert gammas == [0.5, 0.5]
@@ -285,7 +285,7 @@ class TestOptions:
 
     @pytest.mark.parametrize(("name", "levels"), [("dqn", 1), ("drqn", 1), ("hdqn", 2), ("v1", 2), ("v2", 2)])
     @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
-    def test_longer_targets_at_every_level(self, name, levels, settings):
+    def test_longer_targets_are_used_at_every_level(self, name, levels, settings):
         algorithm, batch = self.steps(name=name, settings=tiny_settings(batch_size=64, **settings))
         default, _ = self.steps(name=name)
         assert len(algorithm.learners) == levels
@@ -298,8 +298,8 @@ class TestOptions:
             assert changed["target"] != usual["target"]
 
     @pytest.mark.parametrize(("name", "burns"), [("dqn", False), ("hdqn", False), ("drqn", True), ("v1", True)])
-    def test_only_what_has_a_memory_burns_in(self, name, burns):
-        """Without one, all steps of a sequence are trained that have a target."""
+    def test_only_networks_with_memory_have_burn_in(self, name, burns):
+        """Networks without memory train every step that has a target."""
         algorithm, batch = self.steps(name=name, settings=tiny_settings(batch_size=256))
         for learner in algorithm.learners.values():
             learner.store(batch)
@@ -310,7 +310,7 @@ class TestOptions:
             assert (learner.loss(sample)["trained_steps"] < everything) == burns
 
     @pytest.mark.parametrize(("smdp_discount", "discount"), [(True, 0.5**3), (False, 0.5)])
-    def test_smdp_discount_in_the_meta_target(self, smdp_discount, discount):
+    def test_smdp_discount_decides_the_discount_of_the_meta_target(self, smdp_discount, discount):
         algorithm, batch = self.steps(gamma=0.5, smdp_discount=smdp_discount, settings=unbounded())
         meta = algorithm.learners["meta"]
         options = meta.extract(batch)[None, :2]
@@ -322,7 +322,7 @@ class TestOptions:
         value_everything_at(meta, 8.0)
         assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
 
-    def test_for_the_sub_controller_a_reached_subgoal_is_the_end_and_what_a_time_limit_cut_off_has_no_target(self):
+    def test_sub_targets_end_at_the_subgoal_and_are_left_out_at_time_limits(self):
         algorithm, batch = self.steps(gamma=0.5, max_option_steps=2, settings=unbounded())
         sub, after = algorithm.learners["sub"], batch["next"]
         value_everything_at(sub, 8.0)
@@ -340,7 +340,7 @@ class TestOptions:
                 wanted = chosen["next", "intrinsic_reward"][:, 0].mean().item() + following
                 assert result["target"].item() == pytest.approx(wanted, abs=1e-5)
 
-    def test_in_mid_sequence_a_time_limit_is_left_out_and_the_next_option_restarts(self):
+    def test_time_limits_inside_a_sequence_are_left_out_and_the_state_restarts(self):
         algorithm, batch = self.steps(max_option_steps=2)
         sub = algorithm.learners["sub"]
         steps = sub.extract(batch)[:, :5]
@@ -350,7 +350,7 @@ class TestOptions:
         assert sub.loss(steps)["trained_steps"] == 2 * len(steps)
 
     @pytest.mark.parametrize(("mask_reached", "following"), [(True, 2.0), (False, 8.0)])
-    def test_a_subgoal_that_is_gone_has_no_part_in_the_meta_target(self, mask_reached, following):
+    def test_the_meta_target_ignores_subgoals_that_are_gone(self, mask_reached, following):
         algorithm, batch = self.steps(mask_reached=mask_reached, smdp_discount=False, gamma=0.5, settings=unbounded())
         meta = algorithm.learners["meta"]
         rows = meta.extract(batch)
@@ -367,25 +367,25 @@ class TestOptions:
         wanted = options["next", "option_return"][:, 0].mean().item() + 0.5 * following
         assert meta.loss(options)["target"].item() == pytest.approx(wanted)
 
-    def test_mask_reached(self):
+    def test_mask_reached_removes_attained_subgoals_from_the_mask(self):
         for mask_reached in (True, False):
             _, batch = self.steps(batches=3, mask_reached=mask_reached)
             starts = batch["option_init"].squeeze(-1)
             allowed = batch["subgoal_mask"].gather(-1, batch["subgoal"].unsqueeze(-1))[starts]
             assert allowed.all() == mask_reached
 
-    def test_repeatable_subgoals(self):
+    def test_repeatable_subgoals_stay_in_the_mask(self):
         for repeatable in (True, False):
             _, batch = self.steps(repeatable_subgoals=repeatable)
             assert batch["subgoal_mask"].all() == repeatable
 
-    def test_rewards(self):
+    def test_reward_options_reach_the_critic(self):
         _, batch = self.steps(batches=3)
         assert batch["next", "intrinsic_reward"].unique().tolist() == [-1.0, 0.0, 1.0]
         _, batch = self.steps(batches=3, hazard_reward=-0.25, wrong_subgoal_reward=-0.5)
         assert batch["next", "intrinsic_reward"].unique().tolist() == [-0.5, -0.25, 0.0, 1.0]
 
-    def test_max_option_steps(self):
+    def test_max_option_steps_limits_options(self):
         for limit in (None, 3):
             _, batch = self.steps(max_option_steps=limit)
             assert batch["next", "option_steps"].max() == (limit or 7)
@@ -400,13 +400,13 @@ class TestOptions:
         ],
         ids=str,
     )
-    def test_version_and_meta_input(self, options, entries):
+    def test_version_and_meta_input_decide_what_the_meta_controller_reads(self, options, entries):
         options = dict(options)
         algorithm, batch = self.steps(name=options.pop("version", "v2"), **options)
         stored = algorithm.learners["meta"].extract(batch)
         assert entries == {"observation", "sub_hidden", "sub_cell"} & set(stored.keys())
 
-    def test_meta_input_time(self):
+    def test_meta_input_time_decides_which_state_the_meta_controller_reads(self):
         policies = [
             build("v2", small_env(2), meta_input_time=time).policy
             for time in ("after_last_decision", "after_last_observation")
@@ -452,13 +452,13 @@ class TestOptions:
             (make_hdqn, {"gamma": 2.0}, r"gamma must lie in \[0, 1\], got 2.0; "),
         ],
     )
-    def test_wrong_values(self, make, options, message):
+    def test_wrong_arguments_are_refused(self, make, options, message):
         with pytest.raises(ValueError, match=message):
             make(small_env(2), NETWORKS["compact"], **options)
 
 
 def test_short_options_and_short_episodes_are_trained():
-    """One to three options an episode, slices of eight: most of the meta-controller's sequences are padding."""
+    """With one to three options per episode and slices of eight, the meta-controller's sequences are mostly padding."""
     torch.manual_seed(0)
     env = small_env(8)
     algorithm = build("v2", env, settings=tiny_settings(slice_len=8, batch_size=16))
@@ -510,26 +510,26 @@ OPTIONS = [settings for settings in FLAT + PRIORITISED + STORED if settings["sam
 
 @cache
 def played(make):
-    """Batches of an algorithm that is made by ``make``."""
+    """Batches collected by an algorithm that ``make`` builds."""
     torch.manual_seed(0)
     env = small_env(8)
     return collect(make(env, NETWORKS["compact"]), env, 10, batches=3)
 
 
 class TestSequences:
-    """Every way to draw sequences, with every level that takes it."""
+    """Every way to draw sequences, with every level that supports it."""
 
     @pytest.mark.parametrize("settings", FLAT + PRIORITISED + STORED, ids=str)
     @pytest.mark.parametrize(("make", "level"), [(make_drqn, "learner"), (make_hdrqn, "sub")], ids=["drqn", "v2"])
-    def test_of_steps(self, make, level, settings):
+    def test_sequences_of_steps_are_drawn_by_every_sampling(self, make, level, settings):
         self.check(make, level, settings)
 
     @pytest.mark.parametrize("settings", OPTIONS, ids=str)
-    def test_of_options(self, settings):
+    def test_sequences_of_options_are_drawn_by_every_sampling(self, settings):
         self.check(make_hdrqn, "meta", settings)
 
     @pytest.mark.parametrize("settings", STARTS + STORED, ids=str)
-    def test_of_v3(self, settings):
+    def test_sequences_of_v3_are_drawn_by_every_sampling(self, settings):
         self.check(make_v3, "learner", settings)
 
     def check(self, make, level, settings):
@@ -558,7 +558,7 @@ STATES = {
 class TestStoredStates:
     @pytest.mark.parametrize(("name", "level"), STATES)
     @pytest.mark.parametrize("stored_state", [False, True])
-    def test_they_are_stored_and_learned_from_only_if_asked_for(self, name, level, stored_state):
+    def test_states_are_stored_and_used_only_with_stored_state(self, name, level, stored_state):
         torch.manual_seed(0)
         env = small_env(8)
         options = {} if name == "drqn" else {"max_option_steps": 3}
@@ -577,7 +577,7 @@ class TestStoredStates:
             assert learner.loss(sample)["loss"] != before
 
     @pytest.mark.parametrize("name", ["dqn", "hdqn"])
-    def test_a_network_without_any_is_refused(self, name):
+    def test_stored_state_is_refused_for_networks_without_memory(self, name):
         with pytest.raises(ValueError, match="stored_state must be False for networks without memory, got True; "):
             build(name, small_env(2), settings=tiny_settings(stored_state=True))
 
@@ -593,7 +593,7 @@ class TestV3:
         algorithm = self.make(env, **options)
         return algorithm, collect(algorithm, env, 40)[0]
 
-    def test_one_update_moves_every_part_and_the_target_follows(self):
+    def test_one_update_changes_every_part_and_the_target_network(self):
         algorithm, batch = self.steps(learner={"tau": 0.25, "learning_rate": 0.1, "max_grad_norm": None})
         learner, network = algorithm.learners["joint"], algorithm.policy.network
         learner.store(batch)
@@ -607,14 +607,14 @@ class TestV3:
         assert not any(value.requires_grad for value in metrics.values())
         assert set(metrics) == set(learner.loss.out_keys) - {"priority"}
 
-    def test_a_sequence_has_one_step_more_than_are_trained(self):
+    def test_a_sequence_has_one_more_step_than_are_trained(self):
         algorithm, batch = self.steps(learner={"slice_len": 5, "batch_size": 3})
         learner = algorithm.learners["joint"]
         learner.store(batch)
         assert learner.sample().shape == (3, 6)
 
-    def test_what_is_stored(self):
-        """Nothing twice: no next observation, no recurrent state."""
+    def test_no_next_observation_and_no_state_is_stored(self):
+        """No observation is stored twice."""
         algorithm, batch = self.steps()
         stored = algorithm.learners["joint"].extract(batch)
         ends = {("next", key) for key in ("done", "terminated", "truncated")} | {("collector", "traj_ids")}
@@ -645,15 +645,15 @@ class TestV3:
             ("max_meta_target", 1.5, lambda loss: loss.rules[1].largest_return),
         ],
     )
-    def test_options_of_the_loss(self, name, value, read):
+    def test_options_reach_the_loss(self, name, value, read):
         default, changed = (self.make(**options).learners["joint"].loss for options in ({}, {name: value}))
         assert read(default) != read(changed) == value
 
-    def test_double(self):
+    def test_double_reaches_the_loss(self):
         for double in (True, False):
             assert self.make(learner={"double": double}).learners["joint"].loss.double == double
 
-    def test_options_of_the_network(self):
+    def test_options_reach_the_network(self):
         algorithm = self.make(memory_size=9, head_size=7, joint=False)
         network = algorithm.policy.network
         assert (network.hidden_size, network.sub_head[0].out_features, network.joint) == (9, 7, False)
@@ -667,7 +667,7 @@ class TestV3:
         late = batch["next", "subgoal_reached"] & (steps > 1)
         assert (option_return == 0.5 ** (steps - 1))[late].any()  # a goal in order
 
-    def test_max_option_steps(self):
+    def test_max_option_steps_limits_options(self):
         for limit in (None, 3):
             _, batch = self.steps(max_option_steps=limit)
             assert batch["next", "option_steps"].max() == (limit or 7)
@@ -682,7 +682,7 @@ class TestV3:
         assert not isinstance(default.explorations["meta"], RepeatingEpsilonGreedy)
         assert default.explorations["sub"] is not self.make().explorations["sub"]
 
-    def test_single_random_steps_need_nothing_carried(self):
+    def test_exploration_by_single_steps_carries_no_entry(self):
         _, batch = self.steps(sub_exploration=EpsilonGreedy(0.5, 0.5))
         assert "repeated_action" not in batch and "repeated_action" not in batch["next"]
 
@@ -693,8 +693,8 @@ class TestV3:
         ):
             self.make(learner={"sampling": sampling})
 
-    def test_whole_episodes_teach_what_sequences_that_run_on_do(self):
-        """Cut off behind their first episode, sequences that run on are those that are padded there."""
+    def test_whole_episodes_and_continuing_sequences_give_the_same_loss(self):
+        """Continuing sequences, cut off after their first episode, equal those that are padded there."""
         algorithm, batch = self.steps(prediction_steps=0, learner={"slice_len": 7, "batch_size": 64})
         learner, losses = algorithm.learners["joint"], {}
         for sampling in ("episode_starts", "whole_episodes"):
@@ -720,30 +720,30 @@ class TestV3:
         with pytest.raises(ValueError, match=r"meta_learning_rate must be None with joint=True, got 0\.1"):
             self.make(meta_learning_rate=0.1)
 
-    def test_settings_of_the_loss_reach_it(self):
+    def test_learner_settings_reach_the_loss(self):
         changes = {"burn_in": 0.25, "loss_function": "smooth_l1", "double": False}
         loss = self.make(learner=changes).learners["joint"].loss
         assert {name: getattr(loss, name) for name in changes} == changes
         loss = self.make(learner={"burn_in": 0.0, "train_exact_states": False}).learners["joint"].loss
         assert not loss.train_exact_states
 
-    def test_one_bound_for_both_levels_is_refused(self):
+    def test_max_target_of_the_learner_is_refused_for_v3(self):
         with pytest.raises(ValueError, match=r"max_target must be None for v3, got 1.0; .* by max_meta_target"):
             self.make(learner={"max_target": 1.0})
 
     @pytest.mark.parametrize("settings", [{"trace_decay": 0.5}, {"n_step": 2}], ids=str)
-    def test_targets_of_the_learner_are_refused(self, settings):
+    def test_trace_decay_and_n_step_of_the_learner_are_refused_for_v3(self, settings):
         with pytest.raises(
             ValueError, match=r"trace_decay and n_step must be left at 0 and 1 for v3, got .*; use v3's own"
         ):
             self.make(learner=settings)
 
-    def test_the_default_learner(self):
+    def test_the_default_slice_len_is_the_length_of_an_episode(self):
         assert V3_LEARNER.sampling == "episode_starts"
         algorithm = make_v3(small_env(2), NETWORKS["compact"])
         assert algorithm.learners["joint"].settings == replace(V3_LEARNER, slice_len=7)  # the steps of an episode
 
-    def test_a_restored_learner_goes_on_alike(self):
+    def test_a_restored_learner_continues_identically(self):
         algorithm, batch = self.steps()
         first, second = algorithm.learners["joint"], self.make().learners["joint"]
         first.store(batch[:, :20])
@@ -761,10 +761,10 @@ class TestV3:
 
 
 class TestRepeatedActions:
-    """Temporally extended epsilon-greedy is not v3's alone."""
+    """Temporally extended epsilon-greedy works with every algorithm."""
 
     @pytest.mark.parametrize("name", ["drqn", "dqn", "v1", "v2", "hdqn"])
-    def test_random_stretches_last_over_steps_but_not_over_episodes(self, name):
+    def test_random_stretches_span_steps_but_not_episodes(self, name):
         torch.manual_seed(0)
         env = small_env(32, max_steps=20, num_goals=2)
         always = RepeatingEpsilonGreedy(1.0, 1.0, exponent=0.01, max_repeats=10)
@@ -782,8 +782,8 @@ class TestRepeatedActions:
         assert torch.isfinite(learner.learn()["loss"])
 
     @pytest.mark.parametrize("name", ["v1", "v2", "hdqn", "v3"])
-    def test_random_stretches_do_not_last_over_options(self, name):
-        """Only every second option explores here: it must not pass its stretch on."""
+    def test_random_stretches_do_not_span_options(self, name):
+        """Only every second option explores here; its random stretch must not continue in the next one."""
         torch.manual_seed(0)
         env = small_env(16, max_steps=30, num_goals=2)
         exploration = SuccessEpsilonGreedy(1.0, 0.0, max_repeats=15, exponent=0.01)
@@ -806,12 +806,12 @@ class TestRepeatedActions:
             build(name, small_env(), meta_exploration=RepeatingEpsilonGreedy())
 
     @pytest.mark.parametrize("name", ["dqn", "drqn", "v1", "v2", "hdqn", "v3"])
-    def test_the_farthest_level_pursues_no_subgoal_whose_success_could_count(self, name):
+    def test_success_epsilon_greedy_is_refused_at_the_top_level(self, name):
         place = "exploration" if name in ("drqn", "dqn") else "meta_exploration"
         with pytest.raises(ValueError, match="not be a SuccessEpsilonGreedy where no subgoal is pursued"):
             build(name, small_env(), **{place: SuccessEpsilonGreedy()})
 
-    def test_a_greedy_policy_does_not_repeat(self):
+    def test_a_greedy_policy_does_not_repeat_actions(self):
         env = small_env(4)
         algorithm = build("v2", env, sub_exploration=RepeatingEpsilonGreedy(1.0, 1.0))
         with set_exploration_type(ExplorationType.DETERMINISTIC):
@@ -819,7 +819,7 @@ class TestRepeatedActions:
         assert not steps["repeated_action"].any()
 
 
-def test_bounds_of_targets_in_the_settings_that_come_with_the_project():
+def test_targets_are_bounded_by_default_and_unbounded_as_in_paper():
     found = {}
     with initialize_config_dir(str(configuration.CONF), version_base="1.3"):
         for experiment in (None, "as_in_paper"):

@@ -1,4 +1,4 @@
-"""Builders given environments that do not fit them: one message says everything that is wrong."""
+"""Builders refuse environments that do not fit, with one message that lists every problem."""
 
 import pickle
 from functools import partial
@@ -34,7 +34,7 @@ def walk(*, in_info, read=False):
 
 
 def refusal(name, env):
-    """What a builder says."""
+    """The error message of a builder."""
     with pytest.raises(ValueError) as raised:
         build(name, env)
     return str(raised.value)
@@ -42,12 +42,12 @@ def refusal(name, env):
 
 class TestActions:
     @pytest.mark.parametrize("name", EVERY)
-    def test_one_hot_actions_are_refused_with_the_setting_that_helps(self, name):
+    def test_one_hot_actions_are_refused_with_a_remedy(self, name):
         message = refusal(name, Corridor(N, odd={"action": OneHot(2, shape=(N, 2))}))
         assert "'action' must be one integer below n, [4] int64 (Categorical), got [4, 2] bool (OneHot)" in message
         assert "pass categorical_action_encoding=True to GymEnv or GymWrapper" in message
 
-    def test_gymnasium_s_own_wrapper_is_refused_with_its_default_and_only_then(self):
+    def test_gym_wrapper_is_refused_only_with_its_default_action_encoding(self):
         envs = [
             SerialEnv(2, partial(cart_pole, **settings)) for settings in ({}, {"categorical_action_encoding": True})
         ]
@@ -65,7 +65,7 @@ class TestActions:
         ],
         ids=lambda value: type(value).__name__,
     )
-    def test_actions_of_several_parts_are_refused(self, spec, remedy):
+    def test_actions_that_are_not_one_integer_are_refused(self, spec, remedy):
         assert remedy in refusal("v2", Corridor(N, odd={"action": spec}))
 
 
@@ -100,7 +100,7 @@ class TestObservations:
             "numbers",
         ],
     )
-    def test_what_the_networks_cannot_read_is_refused_before_they_are_built(self, name, spec):
+    def test_observations_that_networks_cannot_read_are_refused(self, name, spec):
         message = refusal(name, Corridor(N, without=("success",), odd={"observation": spec}))
         assert (
             "'observation' must be a square of cell codes [V, V] (Categorical, integers) or a square image" in message
@@ -117,21 +117,21 @@ class TestObservations:
         ids=["int64 cells", "grey", "floats"],
     )
     @pytest.mark.parametrize("name", ["dqn", "v2", "v3"])
-    def test_what_they_can_read_is_learned_from(self, name, spec):
+    def test_agents_learn_from_every_observation_that_networks_can_read(self, name, spec):
         env = Corridor(N, odd={"observation": spec})
         algorithm = build(name, env)
         algorithm.observe(collect(algorithm, env, 16)[0])
         for learner in algorithm.learners.values():
             assert torch.isfinite(learner.learn()["loss"])
 
-    def test_an_architecture_of_one_s_own_reads_what_it_wants(self):
+    def test_a_custom_architecture_may_read_any_observation(self):
         env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
         algorithm = build("v2", env, PLAIN)
         algorithm.observe(collect(algorithm, env, 16)[0])
         assert torch.isfinite(algorithm.learners["sub"].update(algorithm.learners["sub"].sample())["loss"])
 
     @pytest.mark.parametrize("name", ["drqn", "v2", "v3"])
-    def test_what_cannot_be_guessed_is_not_predicted(self, name):
+    def test_observations_without_decoder_cannot_be_predicted(self, name):
         env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
         with pytest.raises(ValueError, match=r"prediction_steps must be 0 if .*, got 3 for \[4, 4\]"):
             build(name, env, PLAIN, prediction_steps=3)
@@ -139,7 +139,7 @@ class TestObservations:
 
 
 class TestGymnasium:
-    """Several ways in which Gymnasium tells of subgoals, and what TorchRL makes of them."""
+    """The ways in which Gymnasium can report subgoals, as TorchRL reads them."""
 
     def walks(self, kind):
         if kind == "info":
@@ -153,7 +153,7 @@ class TestGymnasium:
 
     @pytest.mark.parametrize("kind", ["info", "dictionary", "DISABLED", "DISABLED info"])
     @pytest.mark.parametrize("name", ["v2", "v3"])
-    def test_these_are_learned_from(self, name, kind):
+    def test_agents_learn_from_subgoals_that_gymnasium_reports(self, name, kind):
         env = self.walks(kind)
         algorithm = build(name, env, PLAIN, prediction_steps=0)
         assert algorithm.learners and not algorithm.task.ordered
@@ -164,7 +164,7 @@ class TestGymnasium:
         for learner in algorithm.learners.values():
             assert torch.isfinite(learner.learn()["loss"])
 
-    def test_vectors_that_reset_themselves_in_the_same_step_are_for_plain_observations(self):
+    def test_same_step_autoreset_is_accepted_for_plain_observations_only(self):
         message = refusal("v2", self.walks("SAME_STEP"))
         assert "must be DISABLED, got SAME_STEP; pass AutoresetMode.DISABLED" in message
         vector = gymnasium.make_vec(
@@ -182,7 +182,7 @@ class TestGymnasium:
 
 class TestEntries:
     @pytest.mark.parametrize("name", ["hdqn", "v1", "v2", "v3"])
-    def test_all_that_is_wrong_is_said_at_once_and_all_that_is_there(self, name):
+    def test_one_error_lists_all_problems_and_all_entries(self, name):
         odd = {
             "attained": Binary(shape=(N, 2), dtype=torch.int8),
             "hazard": Binary(shape=(N, 2), dtype=torch.bool),
@@ -200,7 +200,7 @@ class TestEntries:
         ):
             assert problem in message
 
-    def test_subgoals_are_asked_of_agents_that_have_some(self):
+    def test_only_hierarchical_agents_need_attained(self):
         env = Corridor(N, without=("attained", "extrinsic_reward", "hazard", "success"))
         assert "'attained' must be [4, G] bool, it is missing" in refusal("v3", env)
         for name in ("dqn", "drqn"):
@@ -212,11 +212,11 @@ class TestEntries:
         ("num_envs", "remedy"), [(None, r"SerialEnv(16, make_env)"), (2, "not a batch of batches")]
     )
     @pytest.mark.parametrize("name", EVERY)
-    def test_a_batch_of_environments_is_needed_and_one_only(self, name, num_envs, remedy):
+    def test_the_batch_size_must_have_one_dimension(self, name, num_envs, remedy):
         env = Corridor(None) if num_envs is None else ParallelEnv(3, lambda: small_env(num_envs))
         assert remedy in refusal(name, env)
 
-    def test_the_remedies_help(self):
+    def test_the_remedies_in_the_errors_work(self):
         env = Corridor(N, odd={"attained": Binary(shape=(N, 2), dtype=torch.int8)})
         cast = DTypeCastTransform(dtype_in=torch.int8, dtype_out=torch.bool, in_keys=["attained"])
         build("v3", TransformedEnv(env, cast))
@@ -228,7 +228,7 @@ class TestEntries:
 @pytest.mark.parametrize("without", [("hazard", "success"), ("hazard", "success", "truncated")], ids=str)
 @pytest.mark.parametrize("options", [{}, {"hazard_reward": 0.0}], ids=str)
 @pytest.mark.parametrize("name", [*EVERY, "hindsight"])
-def test_agents_learn_without_what_not_every_task_has(name, options, without):
+def test_agents_learn_without_optional_entries(name, options, without):
     env = Corridor(N, without=without)
     if name == "hindsight":
         name, options = "v2", {**options, "sub_hindsight": True, "meta_hindsight": True}
@@ -242,7 +242,7 @@ def test_agents_learn_without_what_not_every_task_has(name, options, without):
 
 
 @pytest.mark.parametrize("name", EVERY)
-def test_transforms_can_be_sent_to_another_process_and_hold_no_environment(name):
+def test_make_transforms_can_be_pickled_and_holds_no_environment(name):
     algorithm = build(name, small_env(N))
     sent = pickle.dumps(algorithm.make_transforms)
     assert b"hdrqn_torchrl.envs" not in sent and b"modules.q_network" not in sent
@@ -254,12 +254,12 @@ def test_transforms_can_be_sent_to_another_process_and_hold_no_environment(name)
     assert (expected == found).all()
 
 
-def test_the_builders_of_v3_name_themselves():
+def test_errors_name_make_v3():
     with pytest.raises(ValueError, match=r"^env must have what make_v3 reads:\n"):
         make_v3(Corridor(None), compact_network(8))
 
 
-def test_those_of_v3_on_an_emulator_can_be_sent_as_well():
+def test_make_transforms_of_v3_on_montezuma_can_be_pickled():
     pytest.importorskip("ale_py")
     env = make_montezuma(1, seed=0)
     make_transforms = pickle.loads(pickle.dumps(build("v3", env).make_transforms))

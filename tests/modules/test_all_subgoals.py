@@ -30,7 +30,7 @@ def make_network(**settings):
 
 
 def sequences(rows=3, steps=9):
-    """What ``unroll`` reads; each row begins with an episode, others begin in its middle."""
+    """Inputs of ``unroll``; each row starts with an episode, and others start in the middle of it."""
     torch.manual_seed(1)
     observation, action = torch.randn(rows, steps, 2), torch.randint(ACTIONS, (rows, steps))
     init, mask = torch.rand(rows, steps) < 0.3, torch.rand(rows, steps, SUBGOALS) < 0.7
@@ -50,7 +50,7 @@ def step(network, observation, action, init, mask, state):
 
 
 def step_by_step(network, observation, action, init, mask, state):
-    """What ``unroll`` computes, as single decisions."""
+    """The outputs of ``unroll``, computed step by step."""
     values = []
     for t in range(observation.shape[1]):
         *value, state = step(network, observation[:, t], action[:, t], init[:, t], mask[:, t], state)
@@ -71,7 +71,7 @@ class TestNetwork:
         same = all((a == b).all() for a, b in zip(unrolled, from_zero, strict=True))
         assert same == from_the_start
 
-    def test_a_single_observation_without_batch(self):
+    def test_step_works_without_batch_dimension(self):
         network, (observation, action, init, mask) = make_network(), sequences(rows=2)
         init = torch.tensor([True, False])
         state = tuple(torch.randn(2, 2, 5))
@@ -82,7 +82,7 @@ class TestNetwork:
             for found, expected in zip((*single[:2], *single[2]), (*whole[:2], *whole[2]), strict=True):
                 torch.testing.assert_close(found, expected[row], **EXACT)
 
-    def test_an_episode_depends_on_nothing_before_it(self):
+    def test_values_do_not_depend_on_earlier_episodes(self):
         network, (observation, action, init, mask) = make_network(), sequences()
         before = unroll(network, observation, action, init, mask)
         observation[:, :4], mask[:, :4] = torch.randn(3, 4, 2), True
@@ -90,7 +90,7 @@ class TestNetwork:
         for old, new in zip(before, unroll(network, observation, action, init, mask), strict=True):
             assert (old[:, 4:] == new[:, 4:]).all() and (old[:, :4] != new[:, :4]).any()
 
-    def test_within_an_episode_past_observations_and_actions_count(self):
+    def test_values_depend_on_earlier_observations_and_actions_of_the_episode(self):
         network, (observation, action, init, mask) = make_network(), sequences()
         init[:, 1:] = False
         before = unroll(network, observation, action, init, mask)[0]
@@ -101,13 +101,13 @@ class TestNetwork:
         differs = (before != unroll(network, observation, action, init, mask)[0]).flatten(2).any(-1)
         assert differs[:, 3:].all() and not differs[:, :3].any()
 
-    def test_the_mask_concerns_the_meta_level_only(self):
+    def test_the_mask_affects_only_the_meta_level(self):
         network, (observation, action, init, mask) = make_network(), sequences()
         before, after = (unroll(network, observation, action, init, which) for which in (mask, ~mask))
         assert (before[0] == after[0]).all() and (before[1] != after[1]).any(-1).all()
 
     def test_values_are_dueling(self):
-        """The mean over the actions is the value stream, and differences are those of the advantages."""
+        """The mean over actions equals the value stream; differences equal those of the advantages."""
         network, inputs = make_network(), sequences(rows=1)
         streams = []
         for head in (network.sub_head, network.meta_head):
@@ -127,24 +127,24 @@ class TestNetwork:
         assert all((p.grad != 0).any() for p in network.meta_head.parameters())
         assert all(p.grad is None for p in network.sub_head.parameters())
 
-    def test_joint_or_not_the_values_are_the_same(self):
+    def test_values_do_not_depend_on_joint(self):
         joint, apart = make_network(), make_network(joint=False)
         for found, expected in zip(unroll(joint, *sequences()), unroll(apart, *sequences()), strict=True):
             assert (found == expected).all()
 
-    def test_sizes(self):
+    def test_sizes_reach_the_layers_of_the_network(self):
         network = make_network(hidden_size=9, head_size=11)
         assert network.memory.hidden_size == 9 and network.initial_state(2, 3)[0].shape == (2, 3, 9)
         assert [head[0].out_features for head in (network.sub_head, network.meta_head)] == [11, 11]
 
     @pytest.mark.parametrize("name", ["hidden_size", "head_size"])
-    def test_wrong_values(self, name):
+    def test_wrong_arguments_are_refused(self, name):
         with pytest.raises(ValueError, match=f"{name} must be >= 1, got 0; "):
             make_network(**{name: 0})
 
 
 def root(rows=3, **entries):
-    """What a policy reads: random observations and states, in the middle of episodes and options."""
+    """Inputs of a policy: random observations and states, in the middle of episodes and options."""
     torch.manual_seed(1)
     td = TensorDict(observation=torch.randn(rows, 2), batch_size=rows)
     td["memory_hidden"], td["memory_cell"] = torch.randn(2, rows, 5)
@@ -180,7 +180,7 @@ class TestPolicy:
         assert (out["next", "memory_hidden"] == hidden).all() and (out["next", "memory_cell"] == cell).all()
         assert (out["next", "previous_action"] == out["action"]).all()
 
-    def test_an_option_does_not_cut_the_memory_and_an_episode_does(self):
+    def test_the_memory_restarts_with_episodes_but_not_with_options(self):
         policy = AllSubgoalsPolicy(make_network())
         yes = torch.ones(3, 1, dtype=torch.bool)
         kept, option, episode = (policy(root(**entry)) for entry in ({}, {"option_init": yes}, {"is_init": yes}))
@@ -189,7 +189,7 @@ class TestPolicy:
         assert (kept[state] == option[state]).all()
         assert (kept[state] != episode[state]).any(-1).all() and (fresh[state] == episode[state]).all()
 
-    def test_only_what_is_left_is_chosen(self):
+    def test_only_subgoals_in_the_mask_are_chosen(self):
         policy = AllSubgoalsPolicy(make_network())
         td = root(option_init=torch.ones(3, 1, dtype=torch.bool))
         for left in range(SUBGOALS):
@@ -199,7 +199,7 @@ class TestPolicy:
                 with set_exploration_type(ExplorationType.RANDOM):
                     assert (policy(td.clone())["subgoal"] == left).all()
 
-    def test_each_level_explores_on_its_own(self):
+    def test_each_level_explores_by_its_own_epsilon(self):
         td = root(rows=1).expand(400).clone()
         td["option_init"] = torch.ones(400, 1, dtype=torch.bool)
         for sub, meta in ((self.ALWAYS, None), (None, self.ALWAYS), (self.NEVER, deepcopy(self.NEVER))):
@@ -214,7 +214,7 @@ class TestPolicy:
             per_subgoal = len(actions_by_subgoal) // len(out["subgoal"].unique())
             assert per_subgoal == (ACTIONS if sub is self.ALWAYS else 1)
 
-    def test_a_random_stretch_in_progress_goes_on(self):
+    def test_a_random_stretch_in_progress_continues(self):
         policy = AllSubgoalsPolicy(make_network(), RepeatingEpsilonGreedy(0.0, 0.0))
         greedy = policy(root())["action"]
         other = (greedy + 1) % ACTIONS
@@ -227,14 +227,14 @@ class TestPolicy:
         assert (out["next", "previous_action"] == out["action"]).all()
 
     @pytest.mark.parametrize("exploration", [None, RepeatingEpsilonGreedy()], ids=["greedy", "repeating"])
-    def test_it_writes_what_it_promises_from_what_it_asks_for(self, exploration):
+    def test_the_policy_reads_in_keys_and_writes_out_keys(self, exploration):
         policy = AllSubgoalsPolicy(make_network(), exploration)
         read = root().select(*policy.in_keys)
         assert len(read.keys()) == len(policy.in_keys)
         out = policy(read.clone())
         assert set(policy.out_keys) == set(out.keys(True, True)) - set(read.keys(True, True))
 
-    def test_keys_can_be_others_and_nested(self):
+    def test_all_keys_can_be_renamed_and_nested(self):
         plain = AllSubgoalsPolicy(make_network(), RepeatingEpsilonGreedy())
         own = ("observation", "previous_action", "is_init", "action", "memory_hidden", "memory_cell", "repeated_action")
         arguments = {"is_init": "init_key", "memory_hidden": "hidden_key", "memory_cell": "cell_key"}
@@ -250,7 +250,7 @@ class TestPolicy:
             assert (out["next", "agent", key] == expected["next", key]).all()
             assert ("agent", key) in moved.make_tensordict_primer().primers.keys(True, True)
 
-    def test_learning_writes_all_values_and_chooses_nothing(self):
+    def test_in_learning_all_values_are_written_and_nothing_is_chosen(self):
         policy, (observation, action, init, mask) = AllSubgoalsPolicy(make_network()), sequences()
         td = TensorDict(observation=observation, previous_action=action, subgoal_mask=mask, batch_size=(3, 9))
         td["is_init"] = init.unsqueeze(-1)
@@ -260,7 +260,7 @@ class TestPolicy:
         assert (out["action_value"] == expected[0]).all() and (out["subgoal_value"].squeeze(-2) == expected[1]).all()
         assert "action" not in out and "next" not in out
 
-    def test_everything_stays_on_the_device(self):
+    def test_all_outputs_are_on_the_device_of_the_inputs(self):
         """Mixing devices raises an error."""
         policy = AllSubgoalsPolicy(make_network(), RepeatingEpsilonGreedy(ladder=1.0), EpsilonGreedy(ladder=1.0))
         policy = policy.to("meta")
@@ -272,7 +272,7 @@ class TestPolicy:
         )
 
 
-def test_values_of():
+def test_values_of_selects_the_values_of_one_subgoal():
     values = torch.arange(12.0).view(2, 3, 2)
     assert values_of(values, torch.tensor([2, 0])).tolist() == [[4.0, 5.0], [6.0, 7.0]]
     assert values_of(values[0], torch.tensor(1)).tolist() == [2.0, 3.0]
@@ -280,7 +280,7 @@ def test_values_of():
 
 
 class TestInTheEnvironment:
-    """Rollouts of random or greedy play through many short episodes, with the values that it acted by."""
+    """Random and greedy rollouts through many short episodes, with the values that were acted by."""
 
     def play(self, steps=40, *, epsilon=0.5, kind=ExplorationType.RANDOM, max_steps=6, learner=None, **options):
         torch.manual_seed(0)
@@ -317,7 +317,7 @@ class TestInTheEnvironment:
         torch.testing.assert_close(subgoal_value, self.subgoal_value, **EXACT)
 
     def test_replayed_sequences_unroll_to_the_values_acted_by(self):
-        """From the memory, in slices that start with any episode and run on through others."""
+        """Slices from the replay memory that start with an episode and continue through others."""
         batch = self.play(max_option_steps=3)
         learner = self.algorithm.learners["joint"]
         learner.store(batch)
@@ -334,7 +334,7 @@ class TestInTheEnvironment:
 
     @pytest.mark.parametrize("sampling", ["steps", "episodes"])
     def test_sequences_from_the_middle_unroll_to_the_values_acted_by(self, sampling):
-        """From stored states, in slices that end with their episode."""
+        """Slices that start from stored states and end with their episode."""
         batch = self.play(learner={"sampling": sampling, "stored_state": True, "slice_len": 4})
         learner, time = self.algorithm.learners["joint"], torch.arange(40).expand(5, 40)
         batch["time"], batch["env"] = time.contiguous(), torch.arange(5)[:, None].expand(5, 40).contiguous()
@@ -347,7 +347,7 @@ class TestInTheEnvironment:
         for values, acted_by in zip(self.unrolled(sample), (self.action_value, self.subgoal_value), strict=True):
             torch.testing.assert_close(values[real], acted_by[place][real], **EXACT)
 
-    def test_what_is_carried_goes_from_step_to_step_and_is_empty_in_every_new_episode(self):
+    def test_state_is_carried_between_steps_and_empty_at_the_start_of_episodes(self):
         batch = self.play()
         init, carried = batch["is_init"].squeeze(-1), ("memory_hidden", "memory_cell", "previous_action")
         for key in (*carried, "repeated_action"):
@@ -358,7 +358,7 @@ class TestInTheEnvironment:
         ended = batch["next", "done"].squeeze(-1)
         assert (batch["next", "repeated_action"][ended][:, 1] > 0).any()  # stretches that did not survive
 
-    def test_the_subgoal_in_force_is_that_of_the_policy(self):
+    def test_the_active_subgoal_is_the_one_that_the_policy_chose(self):
         batch = self.play(max_option_steps=3)
         assert (batch["subgoal"] == batch["next", "active_subgoal"]).all()
         inside = ~batch["option_init"].squeeze(-1)
@@ -367,7 +367,7 @@ class TestInTheEnvironment:
         assert batch["subgoal_mask"].gather(-1, batch["subgoal"][..., None])[starts].all()
 
     @pytest.mark.parametrize("kind", [ExplorationType.DETERMINISTIC, ExplorationType.RANDOM])
-    def test_greedy_play(self, kind):
+    def test_without_exploration_the_policy_is_greedy(self, kind):
         """Also with an epsilon of 0."""
         epsilon = 0.0 if kind == ExplorationType.RANDOM else 1.0
         batch = self.play(epsilon=epsilon, kind=kind, max_option_steps=2)

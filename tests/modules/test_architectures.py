@@ -12,7 +12,7 @@ IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
 
 @pytest.fixture(params=["grid", "image", "vector"])
 def inputs(request):
-    """A spec (or size) and a batch of two sequences of three inputs that fits it."""
+    """A spec (or size), and a batch of two sequences of three inputs for it."""
     if request.param == "grid":
         spec = small_env(4, view=5).observation_spec["observation"]
         return spec, torch.randint(5, (2, 3, 5, 5), dtype=torch.uint8)
@@ -67,18 +67,18 @@ def test_sizes_of_the_compact_network():
 
 
 @pytest.mark.parametrize("make", [compact_network, paper_network])
-def test_gated_features(make):
+def test_gate_features_decides_whether_the_network_has_a_gate(make):
     spec = small_env(4).observation_spec["observation"]
     for gated in (True, False):
         network = make(8, gate_features=gated).q_network(spec, num_actions=4, num_conditions=2)
         assert (network.gate is not None) == gated
 
 
-def test_each_network_has_weights_of_its_own():
+def test_each_network_has_its_own_weights():
     architecture = compact_network(4, (4,))
     first, second = (architecture.q_network(6, num_actions=2) for _ in range(2))
     assert not {id(p) for p in first.parameters()} & {id(p) for p in second.parameters()}
 
 
-def test_is_grid():
+def test_is_grid_tells_cell_codes_from_images():
     assert is_grid(small_env().observation_spec["observation"]) and not is_grid(IMAGE)

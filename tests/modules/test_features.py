@@ -14,7 +14,7 @@ class TestCellsToImage:
                 code = cells[row // 3, column // 3].long()
                 assert image[:, row, column].tolist() == pytest.approx((palette(4)[code] / 255).tolist())
 
-    def test_cells_share_uneven_pixels_in_order(self):
+    def test_cells_get_about_equal_numbers_of_pixels_if_these_do_not_divide(self):
         cells = torch.arange(3, dtype=torch.uint8).repeat(3, 1)
         row = CellsToImage(view=3, num_codes=3, size=44)(cells)[:, 0]
         codes = [(palette(3).t() / 255 == row[:, [x]]).all(0).nonzero().item() for x in range(44)]
@@ -28,7 +28,7 @@ class TestCellsToImage:
 
 
 class TestConvFeatures:
-    def test_bytes_and_floats_of_the_same_image_agree(self):
+    def test_uint8_and_float_images_give_the_same_features(self):
         torch.manual_seed(0)
         features, image = ConvFeatures(channels=(4, 4, 4, 4)), torch.randint(256, (2, 3, 44, 44), dtype=torch.uint8)
         torch.testing.assert_close(features(image), features(image.float() / 255))
@@ -42,22 +42,22 @@ class TestConvFeatures:
         expected = features(image[(0,) * len(leading)])
         torch.testing.assert_close(features(image)[(0,) * len(leading)], expected)
 
-    def test_it_is_four_convolutions_and_a_dense_layer_each_with_relu(self):
+    def test_conv_features_are_four_convolutions_and_a_dense_layer_with_relu(self):
         kinds = [type(layer).__name__ for layer in ConvFeatures().modules() if not list(layer.children())]
         assert kinds == ["Conv2d", "ReLU"] * 4 + ["Flatten", "Linear", "ReLU"]
         assert ConvFeatures().out_features == 256
 
     @pytest.mark.parametrize("size", [33, 44, 84])
-    def test_sizes_that_fit(self, size):
+    def test_image_sizes_from_33_pixels_are_accepted(self, size):
         assert ConvFeatures(1, size, 5, channels=(2, 2, 2, 2))(torch.zeros(1, 1, size, size)).shape == (1, 5)
 
-    def test_an_image_that_is_too_small(self):
+    def test_images_too_small_for_four_convolutions_are_refused(self):
         with pytest.raises(ValueError, match=r"size must be >= 33, got 32; "):
             ConvFeatures(size=32)
 
 
 class TestVectors:
-    def test_cell_features_see_code_and_place_of_every_cell(self):
+    def test_cell_features_depend_on_code_and_place_of_every_cell(self):
         torch.manual_seed(0)
         features = CellFeatures(view=3, num_codes=5, widths=(64,))
         seen = {tuple(features(torch.zeros(3, 3, dtype=torch.uint8)).tolist())}
@@ -75,8 +75,8 @@ class TestVectors:
         torch.testing.assert_close(features(cells)[1, 6], features(cells[1, 6]))
 
     @pytest.mark.parametrize(("view", "like_5x5"), [(3, 9 / 25), (5, 1.0), (19, 1.0)])
-    def test_one_step_of_adam_does_the_same_whatever_the_view(self, view, like_5x5):
-        """A larger window would move by so much more; whole maps were hardly learned because of it."""
+    def test_one_step_of_adam_has_the_same_effect_for_every_view(self, view, like_5x5):
+        """Without scaling, a step changes the output more for a larger window, and whole maps were hardly learned."""
         torch.manual_seed(0)
         moved = []
         for side in (view, 5):
@@ -100,6 +100,6 @@ class TestVectors:
         assert features(torch.zeros(2, 3, 10)).shape == (2, 3, features.out_features)
 
     @pytest.mark.parametrize("dtype", [torch.bool, torch.uint8, torch.int64])
-    def test_fully_connected_features_read_one_hot_vectors_and_numbers_of_any_type(self, dtype):
+    def test_fully_connected_features_accept_any_dtype(self, dtype):
         features, one_hot = FullyConnectedFeatures(3, (4,)), torch.eye(3)
         assert torch.equal(features(one_hot.to(dtype)), features(one_hot))

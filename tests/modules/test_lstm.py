@@ -11,7 +11,7 @@ from hdrqn_torchrl.modules.lstm import Gaps, restarting_lstm
 
 
 def with_gaps(lstm, inputs, init, state):
-    """The other way to the same outputs."""
+    """The same outputs by way of ``Gaps``."""
     gaps = Gaps(init)
     return gaps.remove(gaps.lstm(lstm, [gaps.insert(inputs)], state))
 
@@ -87,7 +87,7 @@ def test_frozen_inputs_and_weights_need_no_gradient(unroll):
 
 
 @both_ways
-def test_the_state_before_a_restart_is_forgotten_and_others_keep_theirs(unroll):
+def test_a_restart_resets_the_state_of_its_own_sequence_only(unroll):
     lstm, inputs, _, (hidden, cell) = make_case(2, 3, 0.0)
     init = torch.tensor([[True, False, False], [False, False, False]])
     outputs = unroll(lstm, inputs, init, (hidden, cell))
@@ -98,8 +98,8 @@ def test_the_state_before_a_restart_is_forgotten_and_others_keep_theirs(unroll):
 class TestGaps:
     init = torch.tensor([[True, False, True, True], [False, False, False, False], [False, True, False, False]])
 
-    def test_one_before_each_restart_but_at_the_first_step(self):
-        """Two in the first row, none in the second, one in the third; then all rows have the same length."""
+    def test_there_is_one_gap_before_each_restart_except_at_the_first_step(self):
+        """Two gaps in the first row, none in the second, one in the third; all rows are then equally long."""
         gaps, numbers = Gaps(self.init), torch.arange(12).view(3, 4)
         rows = gaps.insert(numbers).view(6, 3)
         is_gap = gaps._is_gap.view(6, 3)
@@ -112,8 +112,8 @@ class TestGaps:
         assert (gaps.remove(gaps.insert(numbers)) == numbers).all()
 
     @pytest.mark.parametrize("kind", [torch.float32, torch.float64, torch.bfloat16])
-    def test_behind_a_gap_the_state_is_exactly_zero(self, kind):
-        """However large it was: outputs do not depend on what stands before a restart, nor do gradients reach it."""
+    def test_the_state_is_exactly_zero_after_a_gap(self, kind):
+        """Outputs do not depend on steps before a restart, however large, and no gradient reaches them."""
         torch.manual_seed(0)
         lstm, inputs = nn.LSTM(3, 4).to(kind), torch.randn(3, 4, 3, dtype=kind)
         state = tuple(torch.full((3, 4), 50.0, dtype=kind) for _ in range(2))
@@ -125,14 +125,14 @@ class TestGaps:
         (gradient,) = torch.autograd.grad(outputs[0, 2:].sum(), inputs)
         assert (gradient[0, :2] == 0).all() and (gradient[0, 2:] != 0).all() and (gradient[1:] == 0).all()
 
-    def test_parts_stand_side_by_side(self):
+    def test_parts_of_the_input_are_concatenated(self):
         lstm, inputs, init, state = make_case(3, 6, 0.3)
         gaps = Gaps(init)
         parts = gaps.insert(inputs[..., :2]), gaps.insert(inputs[..., 2:])
         found = gaps.lstm(lstm, list(parts), state)
         assert (found == gaps.lstm(lstm, [gaps.insert(inputs)], state)).all()
 
-    def test_without_gradient_the_outputs_are_the_same(self):
+    def test_outputs_are_the_same_without_gradients(self):
         lstm, inputs, init, state = make_case(3, 6, 0.3)
         with torch.no_grad():
             outputs = with_gaps(lstm, inputs, init, state)
@@ -140,10 +140,10 @@ class TestGaps:
 
 
 class TestAutocast:
-    """Under autocast outputs and gradients are those of float32 but for rounding, on either way."""
+    """Under autocast, outputs and gradients of both implementations equal those in float32 up to rounding."""
 
     @pytest.mark.parametrize("on_gpu", [False, True])
-    def test_outputs_and_gradients(self, on_gpu, monkeypatch):
+    def test_outputs_and_gradients_are_close_to_those_in_float32(self, on_gpu, monkeypatch):
         lstm, inputs, init, state = make_case(4, 30, 0.1)
         lstm, inputs, state = lstm.float(), inputs.float().detach(), [part.float().detach() for part in state]
         leaves = [inputs.requires_grad_(), *(part.requires_grad_() for part in state), *lstm.parameters()]
@@ -160,8 +160,8 @@ class TestAutocast:
             assert gradient.dtype == torch.float32 and relative_error(gradient, want) < 0.02
 
     @pytest.mark.parametrize("on_gpu", [False, True])
-    def test_the_cell_stays_precise(self, on_gpu, monkeypatch):
-        """Where a thousandth is added to 1 in each of 200 steps, it would stand still in bfloat16."""
+    def test_the_cell_keeps_its_precision_under_autocast(self, on_gpu, monkeypatch):
+        """0.001 is added to a cell at each of 200 steps; in bfloat16 the sum would stop growing."""
         if not on_gpu and not multiplies_bfloat16("cpu"):
             pytest.skip("without AMX the cell is lowered, too")
         monkeypatch.setattr(lstm_module, "on_host", lambda tensor: not on_gpu)

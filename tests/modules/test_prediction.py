@@ -7,7 +7,7 @@ from hdrqn_torchrl.modules.prediction import Decoder
 
 
 class TestDecoders:
-    def test_cells_cross_entropy(self):
+    def test_the_cell_decoder_error_is_the_mean_cross_entropy(self):
         torch.manual_seed(0)
         decoder = CellDecoder(6, view=3, num_codes=5)
         vector, cells = torch.randn(2, 4, 6), torch.randint(5, (2, 4, 3, 3), dtype=torch.uint8)
@@ -16,8 +16,8 @@ class TestDecoders:
         torch.testing.assert_close(decoder.error(vector, cells), expected)
 
     @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-    def test_images_coarsely(self, dtype):
-        """A picture of four even quarters is its own coarse version."""
+    def test_the_image_decoder_error_is_that_of_the_coarse_image(self, dtype):
+        """An image of four uniform quarters equals its coarse version."""
         decoder = ImageDecoder(6, channels=2, size=2)
         quarters = torch.tensor([[0, 51], [102, 255]]).expand(2, 2, 2).clone()
         image = quarters.repeat_interleave(4, -1).repeat_interleave(4, -2)
@@ -32,7 +32,7 @@ class TestDecoders:
 
 
 class Sum(Decoder):
-    """Guesses the sum of its vector."""
+    """Predicts the sum of its vector."""
 
     def __init__(self, in_features):
         super().__init__()
@@ -49,7 +49,7 @@ def make_predictor(**settings):
 
 class TestPredictor:
     @pytest.mark.parametrize("ahead", [1, 2, 3])
-    def test_memory_and_the_actions_between_tell_what_follows(self, ahead):
+    def test_a_prediction_depends_on_the_memory_and_the_actions_since(self, ahead):
         predictor = make_predictor()
         memory, action, observation = torch.randn(2, 6, 3), torch.randint(2, (2, 6)), torch.randn(2, 6, 1)
         errors = predictor(memory, action, observation, steps=ahead)
@@ -62,8 +62,8 @@ class TestPredictor:
                 expected = observation[row, t + ahead, 0] - hidden.relu().sum()
                 torch.testing.assert_close(errors[row, t], expected)
 
-    def test_it_learns_a_moving_window(self):
-        """A pointer walks along a ring; memory holds its place, the observation is what lies there."""
+    def test_the_predictor_learns_a_moving_window(self):
+        """A pointer walks along a ring; the memory holds its place, and the observation is what lies there."""
         torch.manual_seed(0)
         ring = torch.randint(3, (8,), dtype=torch.uint8)
         predictor = ObservationPredictor(
@@ -81,6 +81,6 @@ class TestPredictor:
         assert loss.item() < 0.1
 
     @pytest.mark.parametrize("name", ["max_steps", "width"])
-    def test_wrong_values(self, name):
+    def test_wrong_arguments_are_refused(self, name):
         with pytest.raises(ValueError, match=f"{name} must be >= 1, got 0; "):
             make_predictor(**{name: 0})

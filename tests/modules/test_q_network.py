@@ -33,8 +33,8 @@ def test_unroll_equals_a_loop_over_steps(recurrent, num_conditions, restarts, ga
 
 
 @pytest.mark.parametrize("restarts", [[], [0], [3], [0, 2]], ids=str)
-def test_unroll_from_a_given_state_goes_on_from_it(restarts):
-    """Equal to the whole sequence from its beginning, cut in two; where the state restarts it is forgotten."""
+def test_unroll_continues_from_a_given_state(restarts):
+    """A sequence cut in two equals the whole one; a restart discards the given state."""
     network = make_network()
     observation, init = torch.randn(3, 9, 5), torch.zeros(3, 9, dtype=torch.bool)
     state = network.initial_state(3)
@@ -49,7 +49,7 @@ def test_unroll_from_a_given_state_goes_on_from_it(restarts):
     assert torch.allclose(lost[1, 0], whole[1, 4]) == (0 in restarts)
 
 
-def test_a_restart_forgets_what_came_before_and_nothing_else_does():
+def test_only_a_restart_makes_earlier_steps_irrelevant():
     network, observation = make_network(), torch.randn(1, 6, 5)
     changed = observation.clone()
     changed[:, 1] += 1.0
@@ -60,7 +60,7 @@ def test_a_restart_forgets_what_came_before_and_nothing_else_does():
     assert (difference > 0).tolist() == [False, True, True, True, True, True]
 
 
-def test_rows_of_a_batch_do_not_touch_each_other():
+def test_rows_of_a_batch_are_independent():
     network, observation = make_network(), torch.randn(3, 6, 5)
     changed = observation.clone()
     changed[0] += 1.0
@@ -79,7 +79,7 @@ def test_the_condition_changes_the_values():
     assert (first != second).all()
 
 
-def test_one_decision_needs_no_batch():
+def test_step_works_without_batch_dimension():
     network, observation = make_network(), torch.randn(5)
     value, (hidden, cell) = network.step(observation, None, network.initial_state())
     batched, (batched_hidden, batched_cell) = network.step(observation[None], None, network.initial_state(1))
@@ -88,7 +88,7 @@ def test_one_decision_needs_no_batch():
         torch.testing.assert_close(single, several[0])
 
 
-def test_without_recurrence_the_past_does_not_matter():
+def test_without_recurrence_values_ignore_the_past():
     network, observation = make_network(recurrent=False), torch.randn(1, 4, 5)
     torch.testing.assert_close(network.unroll(observation)[:, 2:], network.unroll(observation[:, 2:]))
 
@@ -117,7 +117,7 @@ class TestGatedFeatures:
             plain.step(observation, torch.tensor([0, 0, 0]), state)[0],
         )
 
-    def test_the_factors_are_learned_and_need_a_condition(self):
+    def test_gate_factors_are_learned_and_absent_without_a_condition(self):
         network = make_network(num_conditions=2, gate_features=True)
         network.unroll(torch.randn(1, 2, 5), torch.tensor([[0, 0]])).sum().backward()
         assert network.gate.weight.grad[0].any() and not network.gate.weight.grad[1].any()
@@ -131,6 +131,6 @@ def test_the_initial_state_is_zero():
     assert not cell.any()
 
 
-def test_wrong_hidden_size():
+def test_a_wrong_hidden_size_is_refused():
     with pytest.raises(ValueError, match="hidden_size must be >= 1, got 0; "):
         make_network(hidden_size=0)

@@ -1,4 +1,4 @@
-"""Every number that a module is built from has a rule, and the message names argument, rule, value and a way out."""
+"""Every number that modules are built from is checked; errors name argument, rule, value and remedy."""
 
 import math
 
@@ -57,7 +57,7 @@ SIZES = [(make, name) for make, valid in VALID.items() for name, value in valid.
 
 @pytest.mark.parametrize(("make", "name"), SIZES, ids=lambda part: getattr(part, "__name__", part))
 @pytest.mark.parametrize("wrong", [0, -3, 1.5, True, None, "x"], ids=repr)
-def test_sizes_are_whole_and_positive(make, name, wrong):
+def test_sizes_must_be_positive_integers(make, name, wrong):
     make(**VALID[make])
     with pytest.raises(ValueError, match=rf"^{name} must be .* got {wrong!r}; .+\.$"):
         make(**(VALID[make] | {name: wrong}))
@@ -74,18 +74,18 @@ def test_sizes_are_whole_and_positive(make, name, wrong):
         ([8, 0], r"widths\[1\] must be >= 1, got 0; use"),
     ],
 )
-def test_widths(make, widths, told):
+def test_wrong_widths_are_refused(make, widths, told):
     with pytest.raises(ValueError, match=told):
         make(**(VALID[make] | {"widths": widths}))
 
 
-def test_four_convolutions():
+def test_channels_must_be_four_sizes():
     with pytest.raises(ValueError, match="channels must be four sizes, got 3; "):
         ConvFeatures(channels=(1, 2, 3))
 
 
 @pytest.mark.parametrize("wrong", [-1, 1.5])
-def test_no_condition_and_no_prediction_are_sizes_too(wrong):
+def test_zero_conditions_and_zero_prediction_steps_are_accepted(wrong):
     for change in ({"num_conditions": wrong}, {"prediction_steps": wrong}):
         (name,) = change
         with pytest.raises(ValueError, match=f"{name} must be .*>= 0, got {wrong}; "):
@@ -93,21 +93,21 @@ def test_no_condition_and_no_prediction_are_sizes_too(wrong):
 
 
 @pytest.mark.parametrize("wrong", [-0.5, math.nan, math.inf])
-def test_what_spreads_and_bends_is_finite(wrong):
+def test_exploration_parameters_must_be_finite_and_not_negative(wrong):
     for make, name in ((EpsilonGreedy, "ladder"), (RepeatingEpsilonGreedy, "exponent"), (EpsilonGreedy, "start")):
         with pytest.raises(ValueError, match=f"{name} must .* got {wrong}; "):
             make(**{name: wrong})
 
 
 class TestControllers:
-    """What does not fit each other is told when it is put together."""
+    """Parts that do not fit together are refused when they are combined."""
 
     def network(self, num_actions=2, num_conditions=0, recurrent=True):
         return QNetwork(
             FEATURES, num_actions=num_actions, hidden_size=4, num_conditions=num_conditions, recurrent=recurrent
         )
 
-    def test_an_exploration_is_one(self):
+    def test_an_exploration_of_another_type_is_refused(self):
         network = AllSubgoalsNetwork(FEATURES, num_actions=2, num_subgoals=2)
         for make in (
             lambda wrong: MetaController(self.network(), wrong),
@@ -118,20 +118,20 @@ class TestControllers:
             with pytest.raises(ValueError, match=r"exploration must be an EpsilonGreedy or None, got 0\.1; "):
                 make(0.1)
 
-    def test_a_meta_controller_is_told_no_subgoal(self):
+    def test_a_meta_controller_network_must_have_no_condition(self):
         with pytest.raises(ValueError, match="network must have no condition, got num_conditions=2; "):
             MetaController(self.network(num_conditions=2))
 
     @pytest.mark.parametrize("wrong", [[], "observation"])
-    def test_a_meta_controller_reads_something(self, wrong):
+    def test_a_meta_controller_must_have_input_keys(self, wrong):
         with pytest.raises(ValueError, match=r"input_keys must be a list of at least one entry, got .*; "):
             MetaController(self.network(), input_keys=wrong)
 
-    def test_both_levels_know_the_same_subgoals(self):
+    def test_both_levels_must_have_the_same_number_of_subgoals(self):
         with pytest.raises(ValueError, match="as many conditions as the meta_controller has subgoals, got 2 and 3; "):
             HierarchicalPolicy(MetaController(self.network(3)), SubController(self.network(2, 2)))
 
-    def test_each_level_has_a_schedule_of_its_own(self):
+    def test_two_levels_must_not_share_an_exploration(self):
         shared = EpsilonGreedy()
         for make in (
             lambda: AllSubgoalsPolicy(AllSubgoalsNetwork(FEATURES, num_actions=2, num_subgoals=2), shared, shared),
@@ -142,14 +142,14 @@ class TestControllers:
             with pytest.raises(ValueError, match="meta_exploration must not be the sub level's, got one EpsilonGreedy"):
                 make()
 
-    def test_without_a_state_there_is_none_to_advance(self):
+    def test_reading_the_last_observation_needs_recurrence(self):
         sub = SubController(self.network(2, 2, recurrent=False))
         with pytest.raises(ValueError, match="read_last_observation must be False without recurrence"):
             HierarchicalPolicy(MetaController(self.network()), sub, read_last_observation=True)
 
 
 @pytest.mark.parametrize("name", ["memory_size", "head_size", "prediction_steps"])
-def test_a_builder_names_its_own_arguments(name):
+def test_errors_of_a_builder_name_its_own_arguments(name):
     env = MultiGoalGridEnv(num_envs=2)
     with pytest.raises(ValueError, match=rf"^{name} must be >= [01], got -1; "):
         make_v3(env, compact_network(4, (4,)), **{name: -1})

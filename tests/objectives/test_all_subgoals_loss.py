@@ -1,4 +1,4 @@
-"""The loss on networks that are mere tables of values, against plain loops; then on real ones."""
+"""The loss compared with plain loops, first on tables of values instead of networks, then on real networks."""
 
 import math
 from itertools import product
@@ -77,7 +77,7 @@ class Tables(nn.Module):
 
 
 def make_loss(steps=B * T, *, subgoals=G, actions=A, **settings):
-    """A loss and its two tables; the target's values are others than the main ones."""
+    """A loss with two tables; the target network's values differ from those of the main network."""
     loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(steps, subgoals, actions)), **(FINE | settings))
     with torch.no_grad():
         for value in loss.target_policy_params.values(True, True):
@@ -145,7 +145,7 @@ def start_in_mid_episode(td):
 
 
 def pad(td, seed=0):
-    """Cuts sequences off after 1 to T steps; what is left repeats the last step, as the replay memory has it."""
+    """Cuts sequences off after 1 to T steps; the rest repeats the last step, as in the replay memory."""
     lengths = torch.randint(1, T + 1, (B,), generator=torch.Generator().manual_seed(seed))
     lengths[0], lengths[1] = T, T - 1
     padded = td[torch.arange(B)[:, None], torch.arange(T).expand(B, T).minimum(lengths[:, None] - 1)].contiguous()
@@ -211,7 +211,7 @@ class Reference:
         return self.left[b][t][g] and not self.cut_off(b, t) and belongs
 
     def option_end(self, b, t):
-        """The step with which the option that is on at ``t`` ends, if it is known what that led to."""
+        """The last step of the option in progress at ``t``, if the outcome of that step is known."""
         while t < self.steps - 1 and not self.cut_off(b, t):
             if self.terminated[b][t] or self.starts[b][t + 1]:
                 return t
@@ -219,7 +219,7 @@ class Reference:
         return None
 
     def option_target(self, b, t):
-        """What the whole option brought, and the best that is left after it."""
+        """The return of the whole option, plus the best value after it."""
         last = self.option_end(b, t)
         total = sum(self.s.meta_gamma ** (i - t) * self.extrinsic[b][i] for i in range(t, last + 1))
         if self.terminated[b][last]:
@@ -277,7 +277,7 @@ def mean_loss(errors, loss_function="l2"):
 
 
 def slope(error, loss_function="l2"):
-    """Derivative of one entry's loss by its value."""
+    """Derivative of one entry's loss with respect to its value."""
     return 2 * error if loss_function == "l2" else max(-1.0, min(1.0, error))
 
 
@@ -285,7 +285,7 @@ class TestAgainstPlainLoops:
     @pytest.mark.parametrize("change", [None, pad, start_in_mid_episode])
     @pytest.mark.parametrize("seed", [0, 1])
     @pytest.mark.parametrize("settings", [{}, {"burn_in": 0.5}, *CHANGES], ids=str)
-    def test_losses_targets_and_masks(self, settings, seed, change):
+    def test_losses_targets_and_masks_equal_those_of_plain_loops(self, settings, seed, change):
         """A table's gradient at an entry is 2 (value - target) / count where it is trained, and 0 elsewhere."""
         torch.manual_seed(seed)
         loss = make_loss(**settings)
@@ -309,7 +309,7 @@ class TestAgainstPlainLoops:
         torch.testing.assert_close(subgoal_value.grad, expected_meta, rtol=1e-4, atol=1e-7)
 
     @pytest.mark.parametrize("settings", [{}, {"loss_function": "smooth_l1"}, {"all_subgoals": False}], ids=str)
-    def test_weighted_losses_and_priorities_of_both_levels(self, settings):
+    def test_weighted_losses_and_priorities_of_both_levels_equal_those_of_plain_loops(self, settings):
         loss = make_loss(**settings)
         td = pad(play(loss))
         td["priority_weight"] = (1.0 + torch.arange(B))[:, None].expand(B, T)
@@ -324,7 +324,7 @@ class TestAgainstPlainLoops:
         wanted = [0.9 * max(errors) + 0.1 * sum(errors) / len(errors) if errors else 0.0 for errors in found]
         assert result["priority"].tolist() == pytest.approx(wanted, rel=1e-4)
 
-    def test_the_report(self):
+    def test_the_report_equals_that_of_plain_loops(self):
         loss = make_loss()
         td = play(loss)
         result = loss(td)
@@ -341,7 +341,7 @@ class TestAgainstPlainLoops:
         assert result["meta_q_value"].item() == pytest.approx(sum(meta_values) / len(meta), rel=1e-4)
         assert [name for name, value in result.items() if value.requires_grad] == ["loss"]
 
-    def test_the_sequences_hold_every_case(self):
+    def test_the_test_sequences_include_every_case(self):
         td = play(make_loss())
         after = td["next"][:, :-1]
         done, terminated = after["done"].squeeze(-1), after["terminated"].squeeze(-1)
@@ -410,7 +410,7 @@ END = {"done": 1, "terminated": 1}
         ("0000", {"done": 3, "terminated": 3}, [0.275, 0.3, 0.4], [1.375, 1.5, 2.0]),
     ],
 )
-def test_targets_by_hand(actions, events, sub, meta):
+def test_targets_equal_numbers_computed_by_hand(actions, events, sub, meta):
     loss = make_loss(4, subgoals=1, actions=2, sub_gamma=0.5, meta_gamma=0.5, trace_decay=0.5)
     with torch.no_grad():
         for table, value in zip(tables(loss), ([1.0, 0.0], [0.0], [0.8, 8.0], [4.0]), strict=True):
@@ -436,7 +436,7 @@ def test_targets_by_hand(actions, events, sub, meta):
         (1, {"done": 0, "terminated": 0, "attained": 0}, [1.0], [0.0]),
     ],
 )
-def test_targets_of_padded_sequences_by_hand(real, events, sub, meta):
+def test_targets_of_padded_sequences_equal_numbers_computed_by_hand(real, events, sub, meta):
     loss = make_loss(4, subgoals=1, actions=2, sub_gamma=0.5, meta_gamma=0.5, trace_decay=0.5)
     with torch.no_grad():
         for table, value in zip(tables(loss), ([1.0, 0.0], [0.0], [0.8, 8.0], [4.0]), strict=True):
@@ -464,7 +464,7 @@ def check_gradient(grad, values, targets):
 
 
 class TestInTheEnvironment:
-    """On sequences that real play left in the memory, with a real network."""
+    """With a real network, on sequences from a replay memory of real play."""
 
     def sample(self, settings=None, **options):
         torch.manual_seed(0)
@@ -499,7 +499,7 @@ class TestInTheEnvironment:
         ids=str,
     )
     @pytest.mark.parametrize("options", [{}, {"max_option_steps": 2, "trace_decay": 1.0}], ids=str)
-    def test_losses(self, options, settings):
+    def test_losses_equal_those_of_plain_loops_on_collected_steps(self, options, settings):
         loss, td = self.sample(settings, **options)
         result = loss(td)
         padded = not td.get(("collector", "mask"), torch.tensor(True)).all()
@@ -512,8 +512,8 @@ class TestInTheEnvironment:
         assert result["sub_loss"].item() == pytest.approx(mean_square(sub), rel=1e-4)
         assert result["meta_loss"].item() == pytest.approx(mean_square(meta), rel=1e-4)
 
-    def test_the_gradient_is_that_of_the_errors_and_of_no_target(self):
-        """Targets are numbers: the reference differentiates the values alone."""
+    def test_targets_have_no_gradient(self):
+        """The reference differentiates only the values, not the targets."""
         loss, td = self.sample()
         sub, meta = Reference(self.values(loss, td), td).run()
         network = self.learner.network.network
@@ -534,7 +534,7 @@ class TestInTheEnvironment:
         assert all(not p.requires_grad for p in loss.target_policy_params.values(True, True))
 
     @pytest.mark.parametrize("joint", [True, False])
-    def test_whether_the_meta_loss_reaches_the_memory(self, joint):
+    def test_the_meta_loss_reaches_the_memory_only_if_joint(self, joint):
         loss, td = self.sample(joint=joint)
         network = self.learner.network.network
         with torch.no_grad():
@@ -575,7 +575,7 @@ class TestInTheEnvironment:
         loss(td)["loss"].backward()
         assert all((p.grad != 0).any() for p in network.memory.parameters())
 
-    def test_a_predictor_without_weight_is_not_run(self):
+    def test_a_predictor_with_weight_zero_is_not_run(self):
         loss, td = self.sample(prediction_steps=3, prediction_weight=0.0)
         assert "prediction_loss" not in loss(td) and "prediction_loss" not in loss.out_keys
 
@@ -591,7 +591,7 @@ class TestInTheEnvironment:
         td["memory_hidden"][:, 1:] = math.nan  # only the first one is read
         assert all(torch.isfinite(value).all() for value in self.values(loss, td))
 
-    def test_the_target_moves_by_the_updater_only(self):
+    def test_only_the_updater_changes_the_target_network(self):
         loss, td = self.sample()
         before = loss.target_policy_params.data.clone()
         loss(td)["loss"].backward()
@@ -607,7 +607,7 @@ class TestInTheEnvironment:
 
     @pytest.mark.parametrize("stored_state", [False, True])
     @pytest.mark.parametrize("hazard_reward", [-1.0, 0.0])
-    def test_it_reads_what_it_asks_for_and_nothing_else(self, hazard_reward, stored_state):
+    def test_the_loss_reads_in_keys_and_nothing_else(self, hazard_reward, stored_state):
         settings = {"stored_state": True, "sampling": "steps", "burn_in": 0.0} if stored_state else {}
         loss, td = self.sample(settings, hazard_reward=hazard_reward, intra_option=False)
         td = td.exclude(("collector", "mask"))
@@ -618,7 +618,7 @@ class TestInTheEnvironment:
             with pytest.raises(KeyError):
                 loss(needed.exclude(key))
 
-    def test_keys_can_be_others_and_nested(self):
+    def test_all_keys_can_be_renamed_and_nested(self):
         loss, td = self.sample()
         expected = loss(td)["loss"]
         td["agent_action", "x"] = td.pop("action")
@@ -629,7 +629,7 @@ class TestInTheEnvironment:
         assert loss(td)["loss"] == expected
 
 
-def test_everything_stays_on_the_device():
+def test_all_outputs_of_the_loss_are_on_the_device_of_the_sample():
     """Mixing devices raises an error."""
     loss = make_loss()
     td = play(loss).to("meta")
@@ -637,8 +637,8 @@ def test_everything_stays_on_the_device():
     assert loss(td)["loss"].device.type == "meta"
 
 
-def test_sequences_without_anything_to_train():
-    """All of it cut off by time limits: the loss is 0 and no NaN."""
+def test_sequences_without_trained_steps_have_zero_loss():
+    """If time limits cut off every step, the loss is 0 and not NaN."""
     loss = make_loss()
     td = play(loss)
     td["next", "done"][:], td["next", "terminated"][:], td["next", "attained"][:] = True, False, False
@@ -649,7 +649,7 @@ def test_sequences_without_anything_to_train():
 
 @pytest.mark.parametrize("name", ["sub_gamma", "meta_gamma", "trace_decay"])
 @pytest.mark.parametrize("value", [-0.1, 1.1])
-def test_wrong_values(name, value):
+def test_wrong_arguments_are_refused(name, value):
     with pytest.raises(ValueError, match=rf"{name} must lie in \[0, 1\], got {value}; "):
         make_loss(**{name: value})
 
@@ -664,6 +664,6 @@ def test_wrong_values(name, value):
         ({"loss_function": "l1"}, "loss_function must be 'l2' or 'smooth_l1', got 'l1'; "),
     ],
 )
-def test_wrong_values_of_the_loss_function_and_of_what_it_reads(settings, message):
+def test_wrong_settings_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         make_loss(**settings)

@@ -1,4 +1,4 @@
-"""The loss of v3 with one, two, three and four levels, on tables of values, against the written rule in plain loops."""
+"""The loss of v3 with one to four levels, on tables of values, compared with its written rule in plain loops."""
 
 import math
 
@@ -134,11 +134,11 @@ class Reference:
         return max(self.allowed(level, b, t), key=lambda x: values[level][b * T + t, c, x].item())
 
     def attained(self, level, x, b, t):
-        """Whether choice x of a level was attained in a step: an action is by every step."""
+        """Whether choice x of a level was attained in a step; actions always are."""
         return level == 0 or bool(self.td["next", self.names[level - 1].attained][b, t, x])
 
     def agrees(self, level, x, b, t):
-        """Whether a step is what choice x of a level would have done."""
+        """Whether choice x of a level agrees with a step."""
         if level == 0:
             return self.td["action"][b, t].item() == x
         return self.agrees(level - 1, self.best(self.q, level - 1, x, b, t), b, t)
@@ -217,7 +217,7 @@ class Reference:
 @pytest.mark.parametrize(
     "settings", [{}, {"trace_decay": 0.0}, {"trace_decay": 1.0}, {"double": False}, {"all_subgoals": False}], ids=str
 )
-def test_errors_masks_and_gradients_of_every_level(levels, settings):
+def test_errors_masks_and_gradients_of_every_level_equal_a_brute_force_reference(levels, settings):
     torch.manual_seed(levels)
     loss, names = make_loss(levels, **settings)
     td = play(loss, names, seed=levels)
@@ -237,7 +237,7 @@ def test_errors_masks_and_gradients_of_every_level(levels, settings):
     assert set(result.keys()) == set(loss.out_keys)
 
 
-def test_names_of_figures():
+def test_figures_are_named_after_their_level():
     loss, _ = make_loss(4)
     assert [rule.name for rule in loss.rules] == ["sub", "near", "middle", "meta"]
     assert {"sub_loss", "near_loss", "middle_td_error", "meta_q_value", "td_error", "q_value"} <= set(loss.out_keys)
@@ -291,7 +291,7 @@ def three_levels(actions, **events):
         ("000", {"done": 1, "attained": 1}, [0.4, None], [0.4 * 0 + 0.5 * (0.3 + 0.5), 1.0], [2.0, None]),
     ],
 )
-def test_three_levels_by_hand(actions, events, sub, middle, meta):
+def test_targets_of_three_levels_equal_numbers_computed_by_hand(actions, events, sub, middle, meta):
     td, names = three_levels(actions, **events)
     loss = AllSubgoalsLoss(
         AllSubgoalsPolicy(Tables([1, 1], actions=2, steps=3), subgoal_keys=names),

@@ -67,7 +67,7 @@ def values_in_one_pass(name, policy, steps):
 @pytest.mark.parametrize("epsilon", [0.0, 0.9])
 @pytest.mark.parametrize("name", [*FLAT, *TWO_LEVELS])
 class TestReplay:
-    def test_worlds_actions_and_rewards_are_those_of_an_independent_replay(self, name, epsilon):
+    def test_worlds_actions_and_rewards_equal_an_independent_replay(self, name, epsilon):
         rules, _, pairs = recorded_and_replayed(name, epsilon)
         assert any(len(steps) < 12 for _, steps in pairs) or not epsilon
         for played, steps in pairs:
@@ -89,7 +89,7 @@ class TestReplay:
             assert played[-1].success == bool(last["success"])
             assert [bool(frame.outcome) for frame in played] == [False] * len(steps) + [True]
 
-    def test_q_values_are_those_that_the_controllers_compute(self, name, epsilon):
+    def test_q_values_equal_those_that_the_controllers_compute(self, name, epsilon):
         _, policy, pairs = recorded_and_replayed(name, epsilon)
         for played, steps in pairs:
             with torch.no_grad():
@@ -132,7 +132,7 @@ def test_a_task_without_subgoals_hazard_or_success_can_be_watched():
     assert last.score.extrinsic == last.score.total and not any(frame.event for frame in played)
 
 
-def test_recording_leaves_the_agent_and_the_global_generator_as_they_were():
+def test_recording_does_not_change_the_agent_or_the_global_generator():
     env = small_env(1)
     agent = build("v2", env)
     agent.explorations["sub"].step(12_345)
@@ -148,7 +148,7 @@ def test_recording_leaves_the_agent_and_the_global_generator_as_they_were():
 class TestWalk:
     """Everything below is computed by hand: obstacle, goal 1 and goal 2 stand in a row to the agent's right."""
 
-    def test_scores(self):
+    def test_scores_of_a_scripted_walk(self):
         none, one, both = (False, False), (True, False), (True, True)
         assert [frame.score for frame in walk("v2")] == [
             Score(none, 0.0),
@@ -159,7 +159,7 @@ class TestWalk:
         assert [frame.score.intrinsic for frame in walk("drqn")] == [None] * 4
         assert [frame.score.total for frame in walk("drqn")] == [0.0, -1.0, 0.0, 1.0]
 
-    def test_decisions_and_options(self):
+    def test_decisions_and_options_of_a_scripted_walk(self):
         frames = walk("v2")
         assert [frame.starts_option for frame in frames] == [True, False, True, False]
         assert [frame.subgoal.choice for frame in frames] == [0, 0, 1, 1]
@@ -170,7 +170,7 @@ class TestWalk:
         assert [frame.scene.action for frame in frames] == [RIGHT] * 3 + [None]
         assert [frame.scene.state.agent.item() for frame in frames] == [7, 8, 9, 10]
 
-    def test_events_and_end(self):
+    def test_events_and_end_of_a_scripted_walk(self):
         frames = walk("v2")
         events = ["", "obstacle hit", "goal 1 reached, rᵉˣ +1.00", "goal 2 reached, rᵉˣ +1.00"]
         assert [frame.event for frame in frames] == events
@@ -178,20 +178,20 @@ class TestWalk:
         assert [frame.success for frame in frames] == [False, False, False, True]
         assert {(frame.episode, frame.episodes, frame.max_steps) for frame in frames} == {(1, 1, 9)}
 
-    def test_goals_out_of_order(self):
+    def test_goals_reached_out_of_order_are_marked(self):
         frames = walk("v2", objects=torch.tensor([[8, 10, 9]]))
         events = ["", "obstacle hit", "goal 2 reached, rᵉˣ +0.01", "goal 1 reached, rᵉˣ +0.01"]
         assert [frame.event for frame in frames] == events
         assert [frame.starts_option for frame in frames] == [True, False, False, False]  # it wants goal 1 all the time
         assert (frames[-1].outcome, frames[-1].success) == ("all goals, but not in order", False)
 
-    def test_another_goal_than_the_chosen_one_does_not_end_the_option(self):
+    def test_reaching_another_goal_does_not_end_the_option(self):
         frames = walk("v2", wants=SECOND_GOAL)
         assert [frame.subgoal.choice for frame in frames] == [1, 1, 1, 1]
         assert [frame.pursuits[0].steps for frame in frames] == [0, 1, 2, 3]
         assert frames[-1].score.intrinsic == 0.0 and frames[-1].score.extrinsic == 2.0
 
-    def test_time_limits(self):
+    def test_time_limits_of_options_and_episodes_are_shown(self):
         frames = walk("v2", max_steps=2)
         assert (len(frames), frames[-1].outcome, frames[-1].max_steps) == (3, "time is up", 2)
         frames = walk("v2", options={"max_option_steps": 1})

@@ -38,7 +38,7 @@ def test_bars_show_the_distance_to_the_best():
     assert sub.decision.choice == RIGHT
 
 
-def test_what_is_excluded_has_no_bar_and_is_never_the_best():
+def test_masked_choices_have_no_bar_and_are_never_the_best():
     decision = Decision(values=(3.0, 1.0, 0.5), allowed=(False, True, True), choice=1)
     assert decision.best == 1 and not decision.explores
     level = replace(levels_of(walk("v2")[0], BarSpans())[0], decision=decision)
@@ -50,7 +50,7 @@ def test_if_nothing_is_allowed_anything_may_be_the_best():
     assert Decision(values=(1.0, 2.0), allowed=(False, False), choice=1).best == 1
 
 
-def test_levels_are_named_and_say_since_when_and_whether_by_chance():
+def test_levels_have_names_and_notes_on_duration_and_random_choice():
     started, on, *_ = walk("v2")
     assert [level.note for level in levels_of(started, BarSpans())] == ["just chosen", ""]
     assert [level.note for level in levels_of(on, BarSpans())] == ["for 1 step", ""]
@@ -61,7 +61,7 @@ def test_levels_are_named_and_say_since_when_and_whether_by_chance():
     assert [level.symbol for level in levels_of(walk("drqn")[0], BarSpans())] == ["Q"]
 
 
-def test_captions():
+def test_captions_tell_what_happened_in_a_step():
     assert [caption(frame) for frame in walk("v2", wants=FIRST_GOAL)] == [
         "chooses goal 1",
         "obstacle hit",

@@ -45,7 +45,7 @@ def test_every_algorithm_and_task_is_drawn(name, task):
     assert all((first != second).any() for first, second in pairwise(pictures))
 
 
-def test_bars_are_as_long_as_their_values_say():
+def test_lengths_of_bars_follow_the_values():
     frame = with_values(walk("drqn")[0], (0.5, 0.4, 0.25, -9.0))
     picture = draw_frame(frame, BarSpans(action=0.5))
     best, (second, third) = bars(picture, ACTION_COLOUR)[-1], bars(picture, PALE)
@@ -81,7 +81,7 @@ def test_the_chosen_bar_has_the_colour_of_its_subgoal():
     ],
     ids=str,
 )
-def test_every_fact_can_be_seen_in_its_place(change, where):
+def test_every_fact_is_drawn_in_its_place(change, where):
     frame = walk("v2")[1]
     (name, value), *_ = change.items()
     if isinstance(value, dict):

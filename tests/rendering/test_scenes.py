@@ -39,7 +39,7 @@ def has(part, colour):
 
 
 class TestWorldPicture:
-    def test_every_cell_has_its_colour_and_what_is_not_seen_is_faded(self):
+    def test_every_cell_has_its_colour_and_unseen_cells_are_faded(self):
         picture = pixels(scene_of(corridor()).draw_world(6 * CELL))
         assert picture.shape == (3 * CELL, 6 * CELL, 3)
         assert commonest(cell(picture, 0, 1)) == WALL
@@ -60,7 +60,7 @@ class TestWorldPicture:
         assert has(one, [255] * 3) and has(two, [255] * 3)
         assert ((one == 255).all(-1) != (two == 255).all(-1)).any()
 
-    def test_only_the_subgoal_in_force_has_a_ring(self):
+    def test_only_the_active_subgoal_has_a_ring(self):
         plain, first, second = (
             pixels(scene_of(corridor(), subgoal=each).draw_world(6 * CELL)) for each in (None, 0, 1)
         )
@@ -100,7 +100,7 @@ def test_the_subgoal_is_marked_in_the_view_where_it_is_seen():
     assert (seen != plain).any() and (unseen == plain).all()
 
 
-def test_text_shows_the_same():
+def test_text_shows_the_same_world_as_the_picture():
     scene = scene_of(corridor(), subgoal=1)
     assert scene.write_world().plain == "████████████\n██ @ x 1>2██\n████████████"
     assert scene.write_view().plain == "██████\n██ @ x\n██████"
@@ -109,7 +109,7 @@ def test_text_shows_the_same():
     assert scene_of(room).write_world().plain.splitlines()[1:4] == ["██ @ ·  ██", "██ · ·  ██", "██     1██"]
 
 
-def test_names_and_ends():
+def test_names_of_choices_and_of_ends_of_episodes():
     scene = scene_of(corridor())
     assert scene.subgoal_names == ("goal 1", "goal 2")
     assert [list(colour) for colour in scene.subgoal_colours] == [GOAL_1, GOAL_2]

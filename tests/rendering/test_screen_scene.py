@@ -24,7 +24,7 @@ def test_frames_can_be_drawn(frames):
     draw_text(frames[0])
 
 
-def test_names(frames):
+def test_names_of_subgoals_and_actions(frames):
     scene = frames[0].scene
     assert scene.subgoal_names[:4] == ("middle ladder, foot", "right ladder, foot", "left ladder, foot", "key")
     assert len(scene.action_names) == 18 and scene.action_names[11] == "jump →"
@@ -59,7 +59,7 @@ def test_the_window_is_outlined_and_shown():
     assert np.asarray(seen.draw_view(44)).std() > 10
 
 
-def test_text_is_as_wide_as_it_should_be():
+def test_lines_of_text_have_the_stated_width():
     lines = picture().write_world().plain.split("\n")
     assert {len(line) for line in lines} == {53} and 20 < len(lines) < 30
     assert isinstance(picture().draw_world(100), Image.Image)

@@ -65,6 +65,6 @@ def test_in_a_terminal_frames_replace_each_other_at_their_pace(monkeypatch):
     assert "step 3 of 9" in text and text.count("\x1b[1A") >= 3 * 10  # goes up and draws anew
 
 
-def test_a_pace_out_of_range_is_refused():
+def test_fps_out_of_range_is_refused():
     with pytest.raises(ValueError, match=r"fps must lie in \[1, 50\], got 0"):
         play_in_terminal(walk("v2"), fps=0)

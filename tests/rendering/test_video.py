@@ -24,7 +24,7 @@ def test_frames_are_held_longer_where_an_option_starts_and_an_episode_ends():
     assert [hold(frame, 1) for frame in walk("drqn")] == [1, 1, 1, 2]
 
 
-def test_a_gif_comes_back_frame_by_frame(tmp_path):
+def test_a_written_gif_holds_every_frame(tmp_path):
     frames = walk("v2", recording={"episodes": 2})
     write_video(frames, tmp_path / "episode.gif", fps=4)
     pictures, durations = read_gif(tmp_path / "episode.gif")
@@ -37,12 +37,12 @@ def test_a_gif_comes_back_frame_by_frame(tmp_path):
         assert abs(picture - wanted).max() < 64
 
 
-def test_the_pace_is_kept(tmp_path):
+def test_fps_decides_the_duration_of_frames(tmp_path):
     write_video(walk("v2"), tmp_path / "fast.gif", fps=20)
     assert read_gif(tmp_path / "fast.gif")[1] == [100, 50, 100, 2000]
 
 
-def test_one_frame_makes_a_gif(tmp_path):
+def test_a_gif_of_one_frame_can_be_written(tmp_path):
     write_video(walk("v2")[:1], tmp_path / "one.gif")
     assert len(read_gif(tmp_path / "one.gif")[0]) == 1
 
@@ -61,7 +61,7 @@ def test_the_colours_of_an_end_are_in_the_palette_even_of_a_long_recording(tmp_p
     assert (read_gif(tmp_path / "late.gif")[0][-1][430, 740] == (44, 160, 44)).all()
 
 
-def test_an_mp4_comes_back(tmp_path):
+def test_a_written_mp4_holds_every_frame(tmp_path):
     av = pytest.importorskip("av")
     frames = walk("v2")
     write_video(frames, tmp_path / "episode.mp4", fps=4)
@@ -75,7 +75,7 @@ def test_an_mp4_comes_back(tmp_path):
         assert abs(picture - original).mean() < 4
 
 
-def test_without_pyav_the_remedy_is_named(monkeypatch, tmp_path):
+def test_without_pyav_the_error_says_what_to_install(monkeypatch, tmp_path):
     monkeypatch.setattr(video, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'hdrqn_torchrl\[video\]'"):
         check_video(tmp_path / "x.mp4", fps=4)
@@ -92,12 +92,12 @@ def test_without_pyav_the_remedy_is_named(monkeypatch, tmp_path):
         ("x.gif", 51, "fps must lie in"),
     ],
 )
-def test_what_can_not_be_written_is_refused(tmp_path, name, fps, message):
+def test_other_file_endings_and_fps_are_refused(tmp_path, name, fps, message):
     with pytest.raises(ValueError, match=message):
         write_video(walk("v2"), tmp_path / name, fps=fps)
     assert not list(tmp_path.iterdir())
 
 
-def test_there_must_be_something_to_write(tmp_path):
+def test_an_empty_recording_is_refused(tmp_path):
     with pytest.raises(ValueError, match="frames must hold at least one frame"):
         write_video([], tmp_path / "x.gif")

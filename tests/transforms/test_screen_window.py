@@ -18,7 +18,7 @@ SCREEN = torch.arange(6 * 8, dtype=torch.uint8).view(6, 8, 1)  # rows of 8
         ((-5.0, 3.0), [[0, 0], [0, 0]]),
     ],
 )
-def test_a_window_around_a_place(position, expected):
+def test_cut_out_takes_a_window_around_a_position(position, expected):
     assert cut_out(SCREEN, torch.tensor(position), 2).squeeze(-1).tolist() == expected
 
 
@@ -42,14 +42,14 @@ def test_resizing_keeps_means_and_puts_channels_first():
 
 
 @pytest.mark.parametrize("keep", [False, True])
-def test_the_screen_goes_unless_it_is_kept(keep):
+def test_the_screen_is_removed_unless_keep_pixels(keep):
     step = TensorDict({"pixels": torch.zeros(3, 210, 160, 3, dtype=torch.uint8), "position": torch.zeros(3, 2)}, [3])
     after = Window(keep_pixels=keep).forward(step)
     assert after["observation"].shape == (3, 3, 44, 44)
     assert ("pixels" in after) == keep
 
 
-def test_other_keys():
+def test_all_keys_can_be_renamed():
     step = TensorDict({("a", "screen"): torch.ones(10, 10, 3, dtype=torch.uint8)}, [])
     after = Window(view=None, size=5, pixels_key=("a", "screen"), out_key=("a", "small")).forward(step)
     assert after["a", "small"].shape == (3, 5, 5)
@@ -57,13 +57,13 @@ def test_other_keys():
 
 
 @pytest.mark.parametrize("settings", [{"view": 0}, {"size": 0}])
-def test_wrong_settings(settings):
+def test_wrong_settings_are_refused(settings):
     (name,) = settings
     with pytest.raises(ValueError, match=f"{name} must be >= 1.*, got 0; "):
         Window(**settings)
 
 
-def test_specs_in_an_environment():
+def test_specs_of_an_environment_with_a_window():
     pytest.importorskip("ale_py")
     from hdrqn_torchrl.envs import MontezumaEnv
 
@@ -79,7 +79,7 @@ class TestInterpolated:
 
     @pytest.mark.parametrize("size", [44, 84, 33, 7, 100, 2, 1])
     @pytest.mark.parametrize("channels", [1, 3, 4])
-    def test_it_is_what_a_cpu_makes_of_them(self, size, channels):
+    def test_interpolated_equals_interpolate_on_a_cpu(self, size, channels):
         """Both memory layouts: PyTorch has a kernel for each. (That of layers side by side fails for size 1.)"""
         for sides in self.SIDES:
             images = torch.randint(256, (2, *sides, channels), dtype=torch.uint8).permute(0, 3, 1, 2)
@@ -89,7 +89,7 @@ class TestInterpolated:
             for layout in [images] if size == 1 else [images, images.contiguous()]:
                 assert (found == expected(layout, size)).all(), sides
 
-    def test_it_is_what_other_devices_get(self, monkeypatch):
+    def test_other_devices_use_interpolated(self, monkeypatch):
         screens = torch.randint(256, (2, 5, 70, 70, 3), dtype=torch.uint8)
         images = resized(screens, 44)
         monkeypatch.setattr("hdrqn_torchrl.transforms.window.on_host", lambda tensor: False)
