@@ -74,3 +74,9 @@ PROGRAMS = {f"hdrqn_torchrl.cli.{name}" for name in commands.PROGRAMS}
 def test_nothing_imports_from_a_program(path):
     imported = {name if name in PROGRAMS else name.rpartition(".")[0] for name in imports_of(path)}
     assert not imported & PROGRAMS
+
+
+def test_no_two_test_files_share_a_name():
+    """Without packages, pytest imports each test file by its name alone."""
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))
