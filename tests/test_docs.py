@@ -12,17 +12,14 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
-from hydra.errors import ConfigCompositionException
 from run_folders import write_run
 
+from hdrqn_torchrl.cli.check import composed
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.cli.configuration import CONF, resolved
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.commands import PROGRAMS
-from hdrqn_torchrl.runs.settings import check
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -36,6 +33,8 @@ SHORTER = {
 
 RUN = "outputs/gridworld-v2/2026-11-22_16-04-11-seed0"
 """The run folder that the pages name."""
+YOURS = "my_conf"
+"""The folder that the pages name in place of a reader's own."""
 
 
 def python_blocks(page: Path) -> list[str]:
@@ -79,9 +78,9 @@ def jobs(arguments: list[str]) -> list[list[str]]:
 
 
 @cache
-def check_training(overrides: tuple[str, ...]) -> None:
-    with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        check(resolved(compose("config", overrides=list(overrides))))
+def check_training(overrides: tuple[str, ...], folder: str | None = None) -> None:
+    """Composes settings, with those of a folder of one's own, and checks their rules."""
+    composed([*overrides, *([] if folder is None else ["--config-dir", str(ROOT / folder)])])
 
 
 def without_seed(job: list[str]) -> tuple[str, ...]:
@@ -110,10 +109,11 @@ def test_python_blocks_run_one_after_the_other(page, tmp_path, monkeypatch):
 @pages
 def test_commands_have_settings_that_exist(page, monkeypatch):
     for program, arguments in calls(page):
-        if program == "train":
-            if "--config-dir" not in arguments:
+        if program in ("train", "check"):
+            folder = arguments[arguments.index("--config-dir") + 1] if "--config-dir" in arguments else None
+            if folder != YOURS:
                 for job in jobs(arguments):
-                    check_training(without_seed(job))
+                    check_training(without_seed(job), folder)
         else:
             seen: list = []
             monkeypatch.setattr(sys, "argv", [f"{program}.py", *arguments])
@@ -130,7 +130,7 @@ def test_scripts_that_are_called_exist(page):
 
 
 def test_a_setting_that_does_not_exist_is_noticed():
-    with pytest.raises(ConfigCompositionException):
+    with pytest.raises(SettingsError):
         check_training(("algo=v3", "algo.sub.tau=1"))
     with pytest.raises(SettingsError):
         check_training(("algo=v3", "+colour=red"))

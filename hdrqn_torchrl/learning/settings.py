@@ -17,40 +17,41 @@ class LearnerSettings:
     The paper states other values for some of them: ``tau=0.001``, a constant learning rate and no clipping of gradients
     (``experiment=as_in_paper`` has them all).
 
-    :class:`~hdrqn_torchrl.learning.learner.Learner` reads what concerns drawing and stepping. ``burn_in``,
-    ``train_exact_states``, ``stored_state``, ``loss_function``, ``double`` and ``max_target`` concern the loss and what
-    is stored for it; the builders of :mod:`hdrqn_torchrl.algorithms` pass them on.
+    :class:`~hdrqn_torchrl.learning.learner.Learner` reads the settings of replay and optimiser. ``burn_in``,
+    ``train_exact_states``, ``stored_state``, ``loss_function``, ``double``, ``max_target``, ``trace_decay`` and
+    ``n_step`` are settings of the loss, to which the builders of :mod:`hdrqn_torchrl.algorithms` pass them.
 
     Args:
-        slice_len: n, transitions of a replayed sequence (steps for the sub level, options for the meta level). What its
-            targets need beyond them is drawn, too (:meth:`lookahead`). ``None``, for v3 only: what the task asks for
-            (see :func:`~hdrqn_torchrl.algorithms.make_v3`).
-        batch_size: sequences of a minibatch.
-        capacity: transitions kept in the replay memory.
+        slice_len: n, number of transitions in a replayed sequence (steps at the sub level, options at the meta level).
+            Transitions beyond them that the targets need are also drawn (:meth:`lookahead`). ``None``, for v3 only:
+            what suits the task (see :func:`~hdrqn_torchrl.algorithms.make_v3`).
+        batch_size: number of sequences in a minibatch.
+        capacity: number of transitions that the replay memory holds.
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
         warmup_frames: environment frames before the first update.
         learning_rate: of Adam.
-        learning_rate_end: where it falls to, linearly, until ``learning_rate_frames``; ``None``: it stays constant.
-        learning_rate_frames: environment frames that this takes: those of the whole training. The default is that of
+        learning_rate_end: the value to which it falls linearly; ``None``: it stays constant.
+        learning_rate_frames: environment frames until then; give those of the whole training. The default is that of
             ``total_frames`` in ``conf/``.
         tau: rate of the soft target update.
         max_grad_norm: gradients are clipped to this norm; ``None``: they are not clipped.
-        burn_in: share of a sequence left out of the loss at its beginning; its steps only bring the recurrent state up
-            to date. (Gradients flow back through it: what is remembered there is learned, too.) None without memory.
-        train_exact_states: train leading steps whose recurrent state is exact (see
+        burn_in: share of a sequence, at its beginning, that is left out of the loss and only warms up the recurrent
+            state. (Gradients flow back through it, so that what is remembered there is also learned.) Ignored without
+            memory.
+        train_exact_states: train those of its steps whose recurrent state is exact (see
             :func:`~hdrqn_torchrl.objectives.training_mask`).
-        stored_state: store the recurrent state that acting had at each step, and let sequences that begin in
-            mid-episode start from it instead of from zero (R2D2; Kapturowski et al., 2019). Costs 8 H bytes a step.
+        stored_state: store the recurrent state that the acting policy had at each step, and start sequences from it
+            instead of from zero (R2D2; Kapturowski et al., 2019). Costs 8 H bytes a step.
         sampling: how sequences are drawn (see :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
-        priority_exponent: alpha: draw sequences in proportion to ``priority**alpha``, where the priority is what the
-            loss reports; R2D2 has 0.9. ``None``: uniformly.
+        priority_exponent: alpha: draw sequences in proportion to ``priority**alpha``, with the priority that the loss
+            reports; R2D2 has 0.9. ``None``: uniformly.
         importance_exponent: beta: weights ``priority**(-alpha * beta)`` correct for it in the loss; 1: in full.
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
-        max_target: largest return there can be; targets are cut off above it. ``None``: what the task states, if it
-            states one; ``"unbounded"``: they are not cut off.
+        max_target: largest possible return; targets are clipped to it. ``None``: what the task states, if anything;
+            ``"unbounded"``: no clipping.
         trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
-        n_step: rewards of a target; 1: one-step targets.
+        n_step: number of rewards in a target; 1: one-step targets.
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (:func:`~hdrqn_torchrl.learning.precision.choose_precision`).
 
     Raises:
@@ -103,7 +104,7 @@ class LearnerSettings:
                 "train_exact_states",
                 self.train_exact_states or not (self.burn_in and self.sampling in FROM_STARTS),
                 f"True with burn_in={self.burn_in} and sampling={self.sampling!r}",
-                "the first steps of an episode would never be trained; or use burn_in=0",
+                "otherwise the first steps of an episode are never trained; or use burn_in=0",
             ),
             (
                 "stored_state",
@@ -131,9 +132,9 @@ class LearnerSettings:
                 raise ValueError(f"{name} must be {rule}, got {getattr(self, name)}; {remedy}.")
 
     def lookahead(self, trace_decay: float | None = None) -> int:
-        """Transitions that are drawn beyond ``slice_len``, so that targets are not cut short.
+        """Number of transitions drawn beyond ``slice_len``, so that targets are not cut short.
 
-        Sequences from the start of an episode are meant to cover it, and have none for Q(lambda).
+        Q(lambda) needs none in sequences from the start of an episode, which are meant to cover all of it.
 
         Args:
             trace_decay: lambda; ``None``: that of these settings.
