@@ -15,7 +15,6 @@ import torch
 
 from hdrqn_torchrl.algorithms import make_drqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import MultiGoalGridEnv
-from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.collectors import ResumableCollector
@@ -25,9 +24,7 @@ from hdrqn_torchrl.runs.trainer import Trainer
 INTERVAL_FRAMES = 50_000  # of conf/config.yaml
 BUILDERS = {
     "drqn": lambda env: make_drqn(env, compact_network()),
-    "v2": lambda env: make_hdrqn(
-        env, compact_network(), meta=LearnerSettings(slice_len=1, capacity=50_000, frames_per_update=16)
-    ),
+    "v2": lambda env: make_hdrqn(env, compact_network()),
     "v3": lambda env: make_v3(env, compact_network()),
 }
 

@@ -178,7 +178,12 @@ def check_equal(learner: Learner, raw: RawLearner, level: str, version: str) -> 
 def filled(version: str, network: str, batches: int) -> Algorithm:
     """An algorithm whose learners have stored some episodes of random play."""
     torch.manual_seed(0)
-    settings = {"learning_rate": LEARNING_RATE, "tau": TAU, "max_grad_norm": MAX_GRAD_NORM}
+    settings = {
+        "learning_rate": LEARNING_RATE,
+        "learning_rate_end": None,
+        "tau": TAU,
+        "max_grad_norm": MAX_GRAD_NORM,
+    }
     env = MultiGoalGridEnv(num_envs=64, seed=0)
     architecture = {"compact": compact_network, "paper": paper_network}[network]()
     algorithm = make_hdrqn(

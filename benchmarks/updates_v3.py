@@ -190,7 +190,9 @@ def filled(precision: str, batches: int) -> Learner:
     """A learner that has stored some episodes of random play; its networks have been trained a little."""
     torch.manual_seed(0)
     env = MultiGoalGridEnv(num_envs=64, seed=0)
-    settings = replace(V3_LEARNER, learning_rate=LEARNING_RATE, tau=TAU, max_grad_norm=MAX_GRAD_NORM)
+    settings = replace(
+        V3_LEARNER, learning_rate=LEARNING_RATE, learning_rate_end=None, tau=TAU, max_grad_norm=MAX_GRAD_NORM
+    )
     algorithm = make_v3(
         env,
         compact_network(),
