@@ -1,4 +1,4 @@
-# `make train` and `make test` set everything up by themselves in .venv.
+# `make train` and `make test` first set up .venv, if needed.
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 ARGS ?=

@@ -1,4 +1,4 @@
-"""What a checkpoint costs: seconds, megabytes and extra memory, with full replay memories, beside training itself.
+"""The cost of a checkpoint with full replay memories: seconds, megabytes and extra memory, next to training itself.
 
 python benchmarks/checkpoints.py [--algo v2] [--saves 5]
 """
@@ -30,7 +30,7 @@ BUILDERS = {
 
 
 class MemoryWatch:
-    """Largest resident memory of this process while it is entered, in bytes, above what it was at the beginning."""
+    """Largest increase of this process's resident memory inside the block, in bytes."""
 
     def __enter__(self) -> MemoryWatch:
         self._before, self.extra, self._on = resident(), 0, True
@@ -100,7 +100,7 @@ def fill(trainer: Trainer, batches) -> None:  # noqa: ANN001
 
 
 def report(trainer: Trainer, folder: Path, speed: float) -> None:
-    """Saves once and prints what it took."""
+    """Saves once and prints the cost."""
     started = time.perf_counter()
     with MemoryWatch() as memory:
         trainer.save()

@@ -2,7 +2,7 @@
 
 Ours is TorchRL's ``Collector`` on the transformed environment with ``HierarchicalPolicy`` (hDRQNv2). The reference
 below plays the same game on plain tensors: networks, epsilon-greedy choice, option book, grid rules, storage into
-preallocated ``[N, T]`` tensors. Played greedily from the same seed both must see the same before anything is timed.
+preallocated ``[N, T]`` tensors. Before timing, greedy play of both from the same seed is checked to be the same.
 Prints one JSON object.
 """
 
@@ -193,7 +193,7 @@ def raw_loop(algorithm: Algorithm, env: MultiGoalGridEnv, *, steps: int, seed: i
 
 @torch.no_grad()
 def check_equal(algorithm: Algorithm, env: MultiGoalGridEnv, transformed: TransformedEnv, steps: int = 60) -> None:
-    """Greedy play from the same seed brings the same steps, resets included."""
+    """Checks that greedy play from the same seed gives the same steps, including resets."""
     transformed.set_seed(7)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         ours = transformed.rollout(steps, algorithm.policy, break_when_any_done=False)

@@ -29,7 +29,7 @@ GAMMA, TAU, LEARNING_RATE, MAX_GRAD_NORM = 0.99, 1e-3, 1e-3, 10.0
 
 
 class RawQNetwork(nn.Module):
-    """Features -> LSTM -> dueling head on sequences ``[B, T, ...]`` from the zero state, restarting where told."""
+    """Features -> LSTM -> dueling head on sequences ``[B, T, ...]`` from the zero state, with restarts."""
 
     def __init__(self, network: QNetwork) -> None:
         super().__init__()
@@ -163,7 +163,7 @@ def raw_twin(learner: Learner, level: str, version: str) -> RawLearner:
 
 
 def check_equal(learner: Learner, raw: RawLearner, level: str, version: str) -> None:
-    """Both give the same loss and gradients on the same minibatches."""
+    """Checks that both give the same loss and gradients on the same minibatches."""
     for _ in range(5):
         sample = learner.sample()
         batch = flatten(level, version, sample)

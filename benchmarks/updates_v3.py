@@ -178,7 +178,7 @@ class RawLearner:
 
 
 def flatten(steps: TensorDictBase) -> Batch:
-    """What is learned from, as plain tensors of the same leading shape."""
+    """The entries that are learned from, as plain tensors with the same leading shape."""
     after = steps["next"]
     batch = {name: steps[name] for name in ("observation", "previous_action", "action")}
     batch |= {"init": steps["is_init"].squeeze(-1), "mask": steps["subgoal_mask"]}
@@ -222,7 +222,7 @@ def filled(precision: str, batches: int) -> Learner:
 
 
 def check_equal(learner: Learner, raw: RawLearner) -> None:
-    """Both give the same loss and gradients on the same minibatches, in float32."""
+    """Checks that both give the same loss and gradients on the same minibatches, in float32."""
     lower, raw.lower = raw.lower, False
     for _ in range(5):
         sample = learner.sample()

@@ -1,6 +1,6 @@
-"""The sequence loss and the replay memory with nothing but TorchRL's own modules around them.
+"""The sequence loss and the replay memory, with only TorchRL's own modules around them.
 
-Task: CartPole without velocities. One observation says where cart and pole are; only a memory tells how fast they move.
+Task: CartPole without velocities. An observation shows where cart and pole are; to know their speed takes a memory.
 Network: ``MLP -> LSTMModule -> MLP -> QValueModule``. From this project come ``RecurrentDQNLoss``, which unrolls any
 such network over replayed sequences, and ``make_sequence_buffer``, which draws them.
 
@@ -56,10 +56,10 @@ def make_network() -> tuple[TensorDictSequential, LSTMModule]:
 
 
 def make_env(lstm: LSTMModule, num_envs: int) -> TransformedEnv:
-    """The LSTM's state lives in the environment's tensordict.
+    """An environment whose tensordict carries the LSTM's state.
 
-    Without the primer there is no state to carry, without ``InitTracker`` nothing tells where an episode begins; the
-    LSTM then starts every single step from zero, and no error is raised.
+    The primer adds the state, and ``InitTracker`` marks where episodes begin. Without them the LSTM would start every
+    step from zero, without an error.
     """
     env = SerialEnv(num_envs, cartpole_without_velocities)
     return TransformedEnv(env, Compose(InitTracker(), RewardSum(), lstm.make_tensordict_primer()))
@@ -91,15 +91,20 @@ def main() -> None:
     explore = EGreedyModule(action, eps_init=1.0, eps_end=0.05, annealing_num_steps=updates * 16)
     policy = TensorDictSequential(network, choose, explore)
 
-    loss = RecurrentDQNLoss(network, gamma=0.99, burn_in=0.5)  # the network as it is: acting is none of its business
+    loss = RecurrentDQNLoss(network, gamma=0.99, burn_in=0.5)  # without exploration
     loss.set_keys(action_value="q")  # reward, done, init, ... keep TorchRL's names
     target = SoftUpdate(loss, tau=0.01)
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-3)
 
-    # With num_envs the storage is [time, env]: slices run on over the collector's batches, and never from one
-    # environment into another (they would in a flat storage, silently).
+    # With num_envs the storage is [time, env]: slices continue over the collector's batches, but never from one
+    # environment into another (in a flat storage they would, without an error).
     buffer = make_sequence_buffer(50_000, slice_len=SLICE_LEN, batch_size=BATCH_SIZE, num_envs=NUM_ENVS)
-    stored = ["observation", "action", "is_init", ("collector", "traj_ids")]  # not the LSTM's state: it grows stale
+    stored = [
+        "observation",
+        "action",
+        "is_init",
+        ("collector", "traj_ids"),
+    ]  # without the LSTM's state, which gets stale
     stored += [("next", key) for key in ("observation", "reward", "done", "terminated", "truncated")]
 
     print(f"return before: {greedy_return(evaluation_env, policy):.0f}")

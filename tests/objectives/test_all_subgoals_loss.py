@@ -15,13 +15,13 @@ from hdrqn_torchrl.modules import AllSubgoalsPolicy, compact_network
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
 
 B, T, G, A = 12, 14, 3, 3
-FINE = {"wrong_subgoal_reward": -0.5}  # by default there is none
+PENALTY = {"wrong_subgoal_reward": -0.5}  # the default is 0
 DEFAULTS = {
     "sub_gamma": 0.95,
     "meta_gamma": 0.97,
     "trace_decay": 0.8,
     "reached_reward": 1.0,
-    **FINE,
+    **PENALTY,
     "hazard_reward": -1.0,
     "double": True,
     "all_subgoals": True,
@@ -78,7 +78,7 @@ class Tables(nn.Module):
 
 def make_loss(steps=B * T, *, subgoals=G, actions=A, **settings):
     """A loss with two tables; the target network's values differ from those of the main network."""
-    loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(steps, subgoals, actions)), **(FINE | settings))
+    loss = AllSubgoalsLoss(AllSubgoalsPolicy(Tables(steps, subgoals, actions)), **(PENALTY | settings))
     with torch.no_grad():
         for value in loss.target_policy_params.values(True, True):
             if value.numel() > 1:
@@ -471,8 +471,8 @@ class TestInTheEnvironment:
         env = small_env(8, max_steps=6, view=5)
         usual = {"sampling": "episode_starts", "slice_len": 10, "batch_size": 32, "learning_rate": 1e-2}
         settings = tiny_settings(**(usual | (settings or {})))
-        sizes = {"memory_size": 8, "head_size": 8, "prediction_steps": 0, **FINE}
-        algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, **(sizes | options))
+        usual = {"memory_size": 8, "head_size": 8, "prediction_steps": 0, "sub_gamma": 0.95, "meta_gamma": 0.97}
+        algorithm = make_v3(env, compact_network(16, (16,)), learner=settings, **(usual | PENALTY | options))
         self.learner = algorithm.learners["joint"]
         for batch in collect(algorithm, env, 20, batches=2):
             self.learner.store(batch)
@@ -482,7 +482,7 @@ class TestInTheEnvironment:
         return self.learner.loss, self.learner.sample()
 
     def values(self, loss, td):
-        """By the main and the target network, ``[B, T, G, A]`` and ``[B, T, G]`` each."""
+        """Q-values by the main and the target network, ``[B, T, G, A]`` and ``[B, T, G]`` each."""
         with torch.no_grad():
             pairs = loss._values(td)[:2]
         return [part for sub, meta in pairs for part in (sub, meta.squeeze(-2))]
