@@ -108,6 +108,7 @@ def make_recurrent_loss(
     *,
     gamma: float = 0.99,
     largest_return: float = math.inf,
+    smallest_return: float = -math.inf,
     loss_keys: Mapping[str, NestedKey | None] | None = None,
     prediction_weight: float = 0.1,
 ) -> RecurrentDQNLoss:
@@ -118,6 +119,7 @@ def make_recurrent_loss(
         settings: how it learns.
         gamma: discount of one environment step.
         largest_return: upper bound of the targets if ``settings.max_target`` is ``None``.
+        smallest_return: their lower bound, unless ``settings.max_target`` is ``"unbounded"``.
         loss_keys: keys that differ from the defaults, for :meth:`RecurrentDQNLoss.set_keys`.
         prediction_weight: weight of the error of the network's predictor, if it has one.
 
@@ -132,6 +134,7 @@ def make_recurrent_loss(
         loss_function=settings.loss_function,
         double=settings.double,
         max_target=largest_target(settings.max_target, largest_return),
+        min_target=-math.inf if settings.max_target == "unbounded" else smallest_return,
         trace_decay=settings.trace_decay,
         n_step=settings.n_step,
         lookahead=1 + settings.lookahead(),  # observations are stored once

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -147,9 +148,10 @@ class LevelBuilder:
         level, has = self.has.levels[index], self.has
         names, max_steps = _keys_of(level), has.task.max_steps
         ends: dict[str, NestedKey] = {"done": keys.DONE, "terminated": keys.TERMINATED, "init": keys.IS_INIT}
-        largest_return = has.task.largest_extrinsic_return
+        largest_return, smallest_return = has.task.largest_extrinsic_return, has.task.smallest_extrinsic_return
         if level.pursues is not None:
             above, largest_return = level.pursues.keys, self._rewards(index).largest_return
+            smallest_return = -math.inf
             ends = {"done": above.option_done, "terminated": above.option_terminated, "init": above.option_init}
         steps, refresh = self._refresh_steps(index), None
         if steps is not None:
@@ -164,6 +166,7 @@ class LevelBuilder:
                     settings,
                     gamma=self.gamma,
                     largest_return=largest_return,
+                    smallest_return=smallest_return,
                     loss_keys={
                         **ends,
                         "action": names.subgoal,

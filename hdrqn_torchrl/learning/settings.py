@@ -49,7 +49,7 @@ class LearnerSettings:
         loss_function: ``"l2"`` or ``"smooth_l1"``.
         double: Double DQN.
         max_target: largest possible return; targets are clipped to it. ``None``: what the task states, if anything;
-            ``"unbounded"``: no clipping.
+            ``"unbounded"``: no clipping, not even to the smallest return that the task states.
         trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
         n_step: number of rewards in a target; 1: one-step targets.
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (:func:`~hdrqn_torchrl.learning.precision.choose_precision`).

@@ -68,8 +68,9 @@ class RecurrentDQNLoss(SequenceLoss):
         train_exact_states: train leading steps, too, whose recurrent state is exact.
         double: choose the next action by the main network (Double DQN) instead of the target network.
         loss_function: ``"l2"`` or ``"smooth_l1"`` (Huber).
-        max_target: targets are cut off above this value: the largest return there can be, where it is known. It
-            stops the overestimation that bootstrapping builds up while rewards are still rare.
+        max_target, min_target: bounds of the targets: the largest and the smallest return there can be, where they are
+            known. They stop the errors that bootstrapping builds up: overestimation while rewards are still rare, and
+            values far below anything possible where episodes are cut off.
         predictor: part of the value network that predicts observations from its memory; its error joins the loss.
         prediction_weight: of that error.
         trace_decay: lambda of Watkins' Q(lambda): a target takes over this share of the next step's own target, if
@@ -141,6 +142,7 @@ class RecurrentDQNLoss(SequenceLoss):
         double: bool = True,
         loss_function: LossFunction = "l2",
         max_target: float | None = None,
+        min_target: float | None = None,
         predictor: ObservationPredictor | None = None,
         prediction_weight: float = 0.1,
         trace_decay: float = 0.0,
@@ -172,7 +174,8 @@ class RecurrentDQNLoss(SequenceLoss):
         self.register_buffer("gamma", torch.tensor(gamma))
         if not self._written_states:
             self.burn_in = 0.0
-        self.max_target, self.trace_decay, self.n_step = max_target, trace_decay, n_step
+        self.min_target, self.max_target = min_target, max_target
+        self.trace_decay, self.n_step = trace_decay, n_step
         self.state_keys = list(state_keys)
 
     @property
@@ -243,7 +246,9 @@ class RecurrentDQNLoss(SequenceLoss):
                 follows=(usable & ~parts.init).roll(-1, 1),  # what the last step gets is not read
                 greedy=best == parts.steps[k.action],
             )
-        return wanted if self.max_target is None else wanted.clamp(max=self.max_target)
+        if self.min_target is None and self.max_target is None:
+            return wanted
+        return wanted.clamp(min=self.min_target, max=self.max_target)
 
     def _longer_targets(
         self, reward: Tensor, ended: Tensor, next_value: Tensor, discount: Tensor, *, follows: Tensor, greedy: Tensor

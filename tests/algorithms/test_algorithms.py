@@ -137,6 +137,13 @@ class TestBoundsOfTargets:
         settings = tiny_settings(max_target=0.5)
         assert self.bound(build(name, small_env(2), settings=settings), level) == 0.5
 
+    @pytest.mark.parametrize("name", ["v1", "v2", "hdqn"])
+    def test_the_meta_level_s_targets_are_bounded_from_below_too(self, name):
+        losses = [learner.loss for learner in build(name, small_env(2)).learners.values()]
+        assert [loss.min_target for loss in losses] == [-math.inf, 0.0]
+        free = build(name, small_env(2), settings=tiny_settings(max_target="unbounded")).learners["meta"].loss
+        assert (free.min_target, free.max_target) == (-math.inf, math.inf)
+
     def test_the_grid_task_bounds_targets_of_v3_on_both_sides(self):
         loss = build("v3", small_env(2, num_goals=3)).learners["joint"].loss
         sub, meta = loss.rules

@@ -120,6 +120,7 @@ def reference(
     exact=True,
     huber=False,
     limit=None,
+    least=None,
     state=None,
     weight=None,
     errors=None,
@@ -164,6 +165,7 @@ def reference(
                 continue
             y = target(row, t, **targets)
             y = y if limit is None else min(y, torch.tensor(limit))
+            y = y if least is None else max(y, torch.tensor(least))
             prediction = q[t, row.action[t]]
             distance = functional.smooth_l1_loss(prediction, y) if huber else (prediction - y) ** 2
             total = total + distance * (1.0 if weight is None else weight[b])
@@ -205,6 +207,8 @@ class TestAgainstPlainLoops:
             {"loss_function": "smooth_l1"},
             {"gamma": 1.0},
             {"max_target": 0.2},
+            {"min_target": 0.1},
+            {"min_target": -0.1, "max_target": 0.2, "n_step": 2},
             {"recurrent": False},
             {"trace_decay": 0.75},
             {"trace_decay": 0.75, "double": False, "burn_in": 0.0, "max_target": 0.2},
@@ -230,6 +234,7 @@ class TestAgainstPlainLoops:
             double=settings.get("double", True),
             huber="loss_function" in settings,
             limit=settings.get("max_target"),
+            least=settings.get("min_target"),
             decay=settings.get("trace_decay", 0.0),
             n=settings.get("n_step", 1),
             lookahead=settings.get("lookahead", 0),
