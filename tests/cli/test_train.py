@@ -36,7 +36,8 @@ SUMMARY = (
 
 
 def choices(group):
-    return sorted(str(path.relative_to(CONF / group).with_suffix("")) for path in (CONF / group).rglob("*.yaml"))
+    files = [path for path in (CONF / group).rglob("*.yaml") if path.parent.name != "learner"]  # parts of algorithms
+    return sorted(str(path.relative_to(CONF / group).with_suffix("")) for path in files)
 
 
 def configure(*overrides):
