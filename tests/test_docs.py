@@ -25,7 +25,7 @@ ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
 SHORTER = {
-    "total_frames=150_000": "total_frames=2_048",  # before the first update is due
+    "total_frames = 150_000": "total_frames = 2_048",  # before the first update is due
     "num_envs=250": "num_envs=4",
     "episodes=250": "episodes=4",
 }

@@ -99,7 +99,7 @@ def test_agents_learn_to_reach_two_goals_in_order(make, frames, threshold):
 
 @pytest.mark.slow
 def test_the_readme_s_training_learns(capsys):
-    """As it stands, with default arguments; a random agent's return is about 0.1."""
+    """As it stands; a random agent's return is about 0.1."""
     exec(python_blocks(README)[0], {"__name__": "readme"})
     assert float(capsys.readouterr().out.split()[-1]) > 0.6
 
