@@ -21,6 +21,7 @@ def make_drqn(
     env: EnvBase,
     architecture: Architecture,
     *,
+    total_frames: int | None = None,
     learner: LearnerSettings = presets.DRQN_LEARNER,
     exploration: EpsilonGreedy | None = None,
     gamma: float = 0.99,
@@ -34,6 +35,8 @@ def make_drqn(
         env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``, ``action``
             and ``reward``.
         architecture: networks.
+        total_frames: environment frames of the whole training, in which the learning rates fall; ``None``: as the
+            settings have it (``learning_rate_frames``).
         learner: how it learns.
         exploration: its schedule; ``None``: that of :mod:`~hdrqn_torchrl.algorithms.presets`.
         gamma: discount of one step.
@@ -49,7 +52,7 @@ def make_drqn(
         >>> list(make_drqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['flat']
     """
-    exploration = exploration or presets.flat_exploration()
+    learner, exploration = learner.lasting(total_frames), exploration or presets.flat_exploration()
     has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", levels=1)
     network = architecture.q_network(
         has.observation, num_actions=has.num_actions, recurrent=recurrent, prediction_steps=prediction_steps

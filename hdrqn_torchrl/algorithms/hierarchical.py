@@ -27,6 +27,7 @@ def make_hdrqn(
     *,
     version: Literal["v1", "v2"] = "v2",
     levels: int = 2,
+    total_frames: int | None = None,
     sub: LearnerSettings = presets.SUB_LEARNER,
     meta: LearnerSettings | None = None,
     middle: LearnerSettings | None = None,
@@ -63,6 +64,8 @@ def make_hdrqn(
         architecture: networks.
         version: what levels that choose subgoals read: ``"v1"`` the observation, ``"v2"`` the state of the level below.
         levels: L; the agent pursues the farthest L - 1 sets of subgoals of the task.
+        total_frames: environment frames of the whole training, in which the learning rates fall; ``None``: as the
+            settings have it (``learning_rate_frames``).
         sub, meta, middle: how each level learns; ``meta=None``: :data:`~hdrqn_torchrl.algorithms.presets.META_LEARNER`,
             for v1 with sequences of two options; ``middle=None``: like ``meta``.
         sub_exploration, meta_exploration, middle_exploration: their schedules; ``None``: those of
@@ -105,7 +108,8 @@ def make_hdrqn(
         ['sub', 'meta']
     """
     _check_version(version, recurrent, meta_input, meta_input_time)
-    meta = meta or presets.meta_learner(version)
+    meta = (meta or presets.meta_learner(version)).lasting(total_frames)
+    sub, middle = sub.lasting(total_frames), (middle or meta).lasting(total_frames)
     _check_levels(levels, meta_hindsight, meta_input_time)
     _check_hindsight(sub, meta, sub_hindsight, meta_hindsight)
     has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", levels=levels)
@@ -138,7 +142,7 @@ def make_hdrqn(
         for index, exploration in enumerate([*middles, meta_exploration], start=1)
     ]
     policy = HierarchicalPolicy(*reversed(uppers), sub_controller, read_last_observation=reads_last).to(env.device)
-    settings = [*[middle or meta] * len(middles), meta]
+    settings = [*[middle] * len(middles), meta]
     learners = [
         build.sub_learner(sub_controller, sub),
         *(

@@ -49,6 +49,7 @@ def make_v3(
     architecture: Architecture,
     *,
     levels: int = 2,
+    total_frames: int | None = None,
     learner: LearnerSettings = presets.V3_LEARNER,
     sub_exploration: EpsilonGreedy | None = None,
     meta_exploration: EpsilonGreedy | None = None,
@@ -82,6 +83,8 @@ def make_v3(
         levels: number of levels. The agent pursues the last ``levels - 1`` sets of subgoals that the task states
             (:class:`~hdrqn_torchrl.envs.Task`). 1: a flat agent with the same memory and loss, which learns from the
             task's total reward.
+        total_frames: environment frames of the whole training, in which the learning rates fall; ``None``: as the
+            settings have it (``learning_rate_frames``).
         learner: how it learns. Without ``stored_state``, ``sampling`` must be ``"episode_starts"`` or
             ``"whole_episodes"``, and ``slice_len`` should cover an episode; with it, shorter sequences may begin
             anywhere. ``slice_len=None``: the longest episode that the task states, up to 200 steps; if episodes may be
@@ -131,7 +134,7 @@ def make_v3(
             f"bonus_reward must be 0 with levels={levels}, got {bonus_reward}; their critic already rewards subgoals."
         )
     has = check_environment(env, architecture, builder="make_v3", levels=levels)
-    learner = _with_sequences(learner, has.task)
+    learner = _with_sequences(learner.lasting(total_frames), has.task)
     sub_exploration = sub_exploration or presets.v3_sub_exploration()
     meta_exploration = meta_exploration or presets.meta_exploration()
     policy = AllSubgoalsPolicy(

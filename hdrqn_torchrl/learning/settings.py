@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling
@@ -146,3 +146,15 @@ class LearnerSettings:
         if self.slice_len is None:
             raise ValueError("slice_len must be a number, got None; only v3 asks the task how long an episode is.")
         return target_lookahead(0.0 if self.sampling in FROM_STARTS else decay, self.n_step, self.slice_len)
+
+    def lasting(self, total_frames: int | None) -> LearnerSettings:
+        """The same settings for a training of so many environment frames: the learning rate falls until its end.
+
+        Args:
+            total_frames: of the whole training; ``None``: no change.
+
+        Examples:
+            >>> LearnerSettings().lasting(200_000).learning_rate_frames
+            200000
+        """
+        return self if total_frames is None else replace(self, learning_rate_frames=total_frames)

@@ -27,7 +27,7 @@ BUILDERS = {
     "v3": make_v3,
 }
 LEARNERS = {"sub", "meta", "learner"}
-PYTHON_ONLY = {"repeatable_subgoals"}  # tells what the environment is like, not how to learn
+PYTHON_ONLY = {"repeatable_subgoals", "total_frames"}  # what the environment is like; what conf/ puts into learners
 DIFFERS = {"precision": ("auto", "fp32")}  # a training asks the machine; a call in Python computes the same on all
 NOT_V3 = {"max_target", "trace_decay", "n_step"}  # v3's loss has targets of its own
 
@@ -128,3 +128,11 @@ def test_default_agents_have_the_same_weights_from_python_and_from_conf():
         weights.append(make(env, network).policy.state_dict())
     assert weights[0].keys() == weights[1].keys()
     assert all(torch.equal(weights[0][key], weights[1][key]) for key in weights[0] if torch.is_tensor(weights[0][key]))
+
+
+@algorithms
+def test_learning_rates_fall_until_the_last_frame_of_a_training(name):
+    learners = BUILDERS[name](small_env(2), compact_network(8, (8,)), total_frames=5_000).learners
+    assert {learner.settings.learning_rate_frames for learner in learners.values()} == {5_000}
+    told = build(composed(name, "total_frames=5000"), small_env(2), compact_network(8, (8,)), place="algo").learners
+    assert [each.settings.learning_rate_frames for each in told.values()] == [5_000] * len(learners)
