@@ -180,7 +180,9 @@ def _check_version(version: str, recurrent: bool, meta_input: str, meta_input_ti
     if version not in ("v1", "v2"):
         raise ValueError(f"version must be 'v1' or 'v2', got {version!r}; v2 reads the state of the level below.")
     if version == "v2" and not recurrent:
-        raise ValueError("version='v2' needs recurrent=True: it reads the LSTM state; use version='v1' for hDQN.")
+        raise ValueError(
+            "recurrent must be True with version='v2', got False: it reads the LSTM state; use version='v1' for hDQN."
+        )
     if meta_input not in ("hidden", "cell", "both"):
         raise ValueError(
             f"meta_input must be one of ['hidden', 'cell', 'both'], got {meta_input!r}; the paper uses 'hidden'."

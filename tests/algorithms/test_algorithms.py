@@ -453,7 +453,11 @@ class TestOptions:
         ("make", "options", "message"),
         [
             (make_hdrqn, {"version": "v9"}, "version must be 'v1' or 'v2', got 'v9'; "),
-            (make_hdrqn, {"version": "v2", "recurrent": False}, "version='v2' needs recurrent=True.*; "),
+            (
+                make_hdrqn,
+                {"version": "v2", "recurrent": False},
+                "recurrent must be True with version='v2', got False.*; ",
+            ),
             (make_hdrqn, {"meta_input": "all"}, "meta_input must be one of .*, got 'all'; "),
             (make_hdrqn, {"meta_input_time": "never"}, "meta_input_time must be .*, got 'never'; "),
             (make_hdqn, {"gamma": 2.0}, r"gamma must lie in \[0, 1\], got 2.0; "),
