@@ -279,7 +279,7 @@ class TestActingAndLearningAgree:
     def test_meta(self, name, network, options):
         algorithm, steps = self.collected(name, network, max_option_steps=2, **options)
         meta = algorithm.policy.meta_controller
-        stored = algorithm.learners["meta"].extract(steps)
+        stored, _ = options_of(algorithm.learners["meta"].extract(steps))
         episodes = 0
         for env in steps.unbind(0):
             for traj in env["collector", "traj_ids"].unique():
@@ -329,14 +329,21 @@ class TestLastObservation:
         steps = collect(algorithm, env, 20)[0]
         assert not steps["sub_hidden"][steps["is_init"].squeeze(-1)].any()
 
-    def test_options_join_without_a_gap(self):
+    def test_what_an_option_led_to_is_what_the_next_one_reads_and_a_cut_episode_ends_with_it_too(self):
         torch.manual_seed(0)
         env = small_env(4)
         algorithm = build("v2", env, max_option_steps=2, meta_input_time="after_last_observation")
-        options = algorithm.learners["meta"].extract(collect(algorithm, env, 30)[0])
-        same = options["collector", "traj_ids"][1:] == options["collector", "traj_ids"][:-1]
-        assert same.any()
-        torch.testing.assert_close(options["sub_hidden"][1:][same], options["next", "sub_hidden"][:-1][same])
+        steps = collect(algorithm, env, 30)[0]
+        rows = algorithm.learners["meta"].extract(steps)
+        starts = steps[steps["option_init"].squeeze(-1)]
+        final = (rows["next", "done"] & ~rows["next", "terminated"]).squeeze(-1)
+        read = {tuple(row.tolist()) for row in starts["sub_hidden"]}
+        assert all(tuple(row.tolist()) in read for row in rows["sub_hidden"][~final])
+        cut = steps[(steps["next", "done"] & ~steps["next", "terminated"]).squeeze(-1)]["next"]
+        with torch.no_grad():
+            hidden, _ = algorithm.policy.sub_controller.advance(cut)
+        found = rows["sub_hidden"][final]
+        assert len(found) > 2 and ((found[:, None] - hidden[None]).abs().amax(-1) < 1e-6).any(1).all()
 
 
 @pytest.mark.slow

@@ -118,9 +118,12 @@ class TestControllers:
             with pytest.raises(ValueError, match=r"exploration must be an EpsilonGreedy or None, got 0\.1; "):
                 make(0.1)
 
-    def test_a_meta_controller_network_must_have_no_condition(self):
-        with pytest.raises(ValueError, match="network must have no condition, got num_conditions=2; "):
+    def test_a_meta_controller_at_the_top_has_no_condition_and_one_below_another_level_has(self):
+        rule = r"condition_key and init_key must be None exactly when the network has no condition, got "
+        with pytest.raises(ValueError, match=rule + r"condition_key=None, init_key=None and num_conditions=2; "):
             MetaController(self.network(num_conditions=2))
+        with pytest.raises(ValueError, match=rule + r"condition_key='a', init_key='b' and num_conditions=0; "):
+            MetaController(self.network(), condition_key="a", init_key="b")
 
     @pytest.mark.parametrize("wrong", [[], "observation"])
     def test_a_meta_controller_must_have_input_keys(self, wrong):
@@ -128,7 +131,9 @@ class TestControllers:
             MetaController(self.network(), input_keys=wrong)
 
     def test_both_levels_must_have_the_same_number_of_subgoals(self):
-        with pytest.raises(ValueError, match="as many conditions as the meta_controller has subgoals, got 2 and 3; "):
+        with pytest.raises(
+            ValueError, match="as many conditions as the meta_controller above it has subgoals, got 2 and 3; "
+        ):
             HierarchicalPolicy(MetaController(self.network(3)), SubController(self.network(2, 2)))
 
     def test_two_levels_must_not_share_an_exploration(self):
