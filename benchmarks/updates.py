@@ -82,8 +82,8 @@ class RawReplay:
 class RawLearner:
     """Double DQN on sequences with two networks, fused Adam and a soft target update."""
 
-    def __init__(self, network: QNetwork, replay: RawReplay) -> None:
-        self.replay = replay
+    def __init__(self, network: QNetwork, replay: RawReplay, bounds: tuple[float, float]) -> None:
+        self.replay, self.bounds = replay, bounds
         self.online, self.target = RawQNetwork(network), RawQNetwork(network).requires_grad_(False)
         self.parameters, self.target_parameters = list(self.online.parameters()), list(self.target.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=LEARNING_RATE, fused=True)
@@ -106,6 +106,7 @@ class RawLearner:
             next_value = target.gather(-1, best.argmax(-1, keepdim=True)).squeeze(-1)
             discount = GAMMA ** now["steps"] if "steps" in batch else GAMMA
             wanted = now["reward"] + (discount * next_value).masked_fill(now["terminated"], 0.0)
+            wanted = wanted.clamp(*self.bounds)
             time = torch.arange(chosen.shape[1])
             trained = (time >= len(time) // 2) | (init[:, :-1].cumsum(1) > 0)
             trained &= now["valid"] & (now["terminated"] | (~now["done"] & valid[:, 1:]))
@@ -159,7 +160,7 @@ def raw_twin(learner: Learner, level: str, version: str) -> RawLearner:
     order = episode.argsort(stable=True)
     rows = flatten(level, version, stored[order].contiguous())
     replay = RawReplay(rows, episode[order], settings.slice_len + 1, settings.batch_size)
-    return RawLearner(learner.network.network, replay)
+    return RawLearner(learner.network.network, replay, (learner.loss.min_target, learner.loss.max_target))
 
 
 def check_equal(learner: Learner, raw: RawLearner, level: str, version: str) -> None:
