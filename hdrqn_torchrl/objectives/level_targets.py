@@ -142,8 +142,7 @@ class LevelTargets:
         steps, names = tensordict[:, :-1], rule.choices
         best = double_q_value(online if self.double else target, target, _mask(rule, tensordict))[:, 1:].unsqueeze(-1)
         attained = steps["next", names.attained].unsqueeze(-2)  # [B, T, 1, X]
-        active = steps["next", names.active_subgoal].unsqueeze(-1)
-        pursued = active == torch.arange(online.shape[-1], device=active.device)
+        pursued = _pursued(names, steps)
         may_learn = agrees[:, :-1] | pursued
         if not self.all_subgoals:
             may_learn = may_learn & pursued
@@ -178,9 +177,7 @@ class LevelTargets:
             reward, ended = rule.rewards.of_all(attained, events.hazard), ended | attained
             trained = trained & steps[rule.pursues.subgoal_mask].unsqueeze(-1)
             if not self.all_subgoals:
-                active = steps["next", rule.pursues.active_subgoal].unsqueeze(-1)
-                pursued = active == torch.arange(attained.shape[-1], device=active.device)
-                trained = trained & pursued.unsqueeze(-1)
+                trained = trained & _pursued(rule.pursues, steps).unsqueeze(-1)
         unseen = events.unseen.unsqueeze(-1) & ~ended
         trace = trace.masked_fill(events.unseen[..., None, None], 0.0)
         trace[:, :-1].masked_fill_(unseen[:, 1:].unsqueeze(-1), 0.0)  # the next step has no target
@@ -255,6 +252,12 @@ def make_rules(
             )
         )
     return tuple(rules)
+
+
+def _pursued(names: OptionKeys, steps: TensorDictBase) -> Tensor:
+    """Which subgoal of a set was in force at each step, ``[B, T, G]`` bool."""
+    active, number = steps["next", names.active_subgoal], steps[names.subgoal_mask].shape[-1]
+    return active.unsqueeze(-1) == torch.arange(number, device=active.device)
 
 
 def _mask(rule: LevelRule, tensordict: TensorDictBase) -> Tensor:
