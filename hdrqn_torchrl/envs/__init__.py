@@ -1,6 +1,7 @@
 """Environments, the scripted players that mark their ceilings, and their Gymnasium twins."""
 
-from hdrqn_torchrl.envs.check import Finding, check_task
+from hdrqn_torchrl.envs.check import check_task
+from hdrqn_torchrl.envs.findings import Finding
 from hdrqn_torchrl.envs.grid.ceilings import ceiling
 from hdrqn_torchrl.envs.grid.environment import MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid.scripted import (
@@ -13,7 +14,8 @@ from hdrqn_torchrl.envs.grid.scripted import (
 )
 from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv
 from hdrqn_torchrl.envs.montezuma.making import make_montezuma
-from hdrqn_torchrl.envs.task import Reference, SubgoalSet, Task, task_of
+from hdrqn_torchrl.envs.subgoals import SubgoalSet
+from hdrqn_torchrl.envs.task import Reference, Task, task_of
 
 __all__ = [
     "EgocentricSearch",

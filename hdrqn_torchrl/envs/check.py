@@ -4,41 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
-from hdrqn_torchrl.envs.task import SubgoalSet, Task, task_of
+from hdrqn_torchrl.envs.findings import Finding, missing, wrong
+from hdrqn_torchrl.envs.subgoals import SubgoalSet
+from hdrqn_torchrl.envs.task import Task, task_of
 
 Rollout = list[TensorDictBase]  # one [N] for each step, its outcome below "next"
 _TOLERANCE = 1e-4  # of sums of rewards
 _GO_ON = 20  # steps after a restored state
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that an environment does wrong or does without.
-
-    Attributes:
-        what: the fault or the gap, in a sentence.
-        severity: ``"wrong"``: against the contract; ``"missing"``: agents can do without it.
-        costs: what that costs.
-    """
-
-    what: str
-    severity: Literal["wrong", "missing"]
-    costs: str
-
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.what} ({self.costs})"
 
 
 def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding]:
@@ -73,14 +56,6 @@ def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding
     return sorted(dict.fromkeys(found), key=lambda finding: finding.severity != "wrong")
 
 
-def _wrong(what: str, costs: str) -> Finding:
-    return Finding(what, "wrong", costs)
-
-
-def _missing(what: str, costs: str) -> Finding:
-    return Finding(what, "missing", costs)
-
-
 def _sets(env: EnvBase, task: Task) -> tuple[SubgoalSet, ...]:
     """The sets of subgoals that the task states, or the one that its entry ``attained`` implies."""
     spec = env.observation_spec.get(keys.ATTAINED, None)
@@ -92,15 +67,15 @@ def _sets(env: EnvBase, task: Task) -> tuple[SubgoalSet, ...]:
 def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
     """What the specs say."""
     if len(env.batch_size) != 1:
-        yield _wrong(f"the batch size must be [N], got {list(env.batch_size)}", "no agent can be made for it")
+        yield wrong(f"the batch size must be [N], got {list(env.batch_size)}", "no agent can be made for it")
         return
     specs = {**dict(env.observation_spec.items()), **dict(env.full_reward_spec.items())}
     specs |= dict(env.full_done_spec.items())
     action = env.full_action_spec.get(keys.ACTION, None)
     if not (type(action) is Categorical and action.shape == env.batch_size):
-        yield _wrong("'action' must be one number [N], a Categorical", "no agent can be made for it")
+        yield wrong("'action' must be one number [N], a Categorical", "no agent can be made for it")
     if keys.OBSERVATION not in specs:
-        yield _wrong("'observation' is missing", "no agent can be made for it")
+        yield wrong("'observation' is missing", "no agent can be made for it")
     wanted = {keys.REWARD: 1, keys.EXTRINSIC_REWARD: 1, keys.HAZARD: 1, task.success: 1}
     wanted |= {keys.DONE: 1, keys.TERMINATED: 1, keys.TRUNCATED: 1}
     for each in _sets(env, task):
@@ -111,42 +86,56 @@ def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
             continue
         if (list(spec.shape), spec.dtype) != ([*env.batch_size, size], kind):
             text = f"{key!r} must be {kind} {[*env.batch_size, size]}, got {spec.dtype} {list(spec.shape)}"
-            yield _wrong(text, "agents that read it can't be made")
+            yield wrong(text, "agents that read it can't be made")
     for key in (keys.REWARD, keys.DONE, keys.TERMINATED):
         if key not in specs:
-            yield _wrong(f"{key!r} is missing", "no agent can be made for it")
+            yield wrong(f"{key!r} is missing", "no agent can be made for it")
     for each in task.subgoals:
         if each.keys.attained not in specs:
-            yield _wrong(f"{each.keys.attained!r} is missing, though its subgoals are stated", "no agent pursues them")
+            yield wrong(f"{each.keys.attained!r} is missing, though its subgoals are stated", "no agent pursues them")
     yield from _optional(specs, task)
 
 
 def _optional(specs: dict, task: Task) -> Iterator[Finding]:
     """Entries that not every agent needs."""
     if not task.subgoals and keys.ATTAINED not in specs:
-        yield _missing("'attained' is missing", "agents of one level only")
+        yield missing("'attained' is missing", "agents of one level only")
     elif keys.EXTRINSIC_REWARD not in specs:
-        yield _missing("'extrinsic_reward' is missing", "agents of one level only")
+        yield missing("'extrinsic_reward' is missing", "agents of one level only")
     if keys.HAZARD not in specs:
-        yield _missing("'hazard' is missing", "no penalty for what is to be avoided")
+        yield missing("'hazard' is missing", "no penalty for what is to be avoided")
     if task.success not in specs:
-        yield _missing(f"{task.success!r} is missing", "no success rate")
+        yield missing(f"{task.success!r} is missing", "no success rate")
 
 
 def _statement(env: EnvBase, task: Task) -> Iterator[Finding]:
-    """What the task leaves unsaid."""
+    """What the task says wrongly or leaves unsaid."""
+    if (stated := _other_statement(env)) is not None:
+        yield wrong(f"'task' must be a Task, got {stated!r}", "what it states is not read")
+    action = env.full_action_spec.get(keys.ACTION, None)
+    if isinstance(action, Categorical) and task.actions and len(task.actions) != action.n:
+        text = f"the task must name {action.n} actions, or none, and names {len(task.actions)}"
+        yield wrong(text, "watch.py shows the wrong ones")
     if task.max_steps is None:
-        yield _missing("the length of episodes is unknown", "evaluations need max_steps, v3 needs slice_len")
+        yield missing("the length of episodes is unknown", "evaluations need max_steps, v3 needs slice_len")
     if task.largest_return == float("inf") or task.largest_extrinsic_return == float("inf"):
-        yield _missing("the largest returns are unknown", "targets are not bounded")
+        yield missing("the largest returns are unknown", "targets are not bounded")
     if not task.subgoals and keys.ATTAINED in env.observation_spec.keys():  # noqa: SIM118 (a spec)
-        yield _missing("the subgoals are not stated", "they have no names, and there is no third level")
+        yield missing("the subgoals are not stated", "they have no names, and there is no third level")
     if not task.actions:
-        yield _missing("the actions have no names", "watch.py numbers them")
+        yield missing("the actions have no names", "watch.py numbers them")
     if not task.references:
-        yield _missing("there are no scripted players", "no ceiling line")
+        yield missing("there are no scripted players", "no ceiling line")
     if task.scene is None and not callable(getattr(type(env), "render", None)):
-        yield _missing("there is neither a scene nor a method render", "watch.py shows observations as numbers")
+        yield missing("there is neither a scene nor a method render", "watch.py shows observations as numbers")
+
+
+def _other_statement(env: EnvBase) -> object:
+    """An attribute ``task`` of TorchRL's own kind of environment that is no ``Task``; Gymnasium's may mean anything."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    stated = None if isinstance(env, BatchedEnvBase | GymWrapper) else getattr(env, "task", None)
+    return None if isinstance(stated, Task) else stated
 
 
 def _behaviour(env: EnvBase, task: Task, steps: int, seed: int) -> list[Finding]:
@@ -184,10 +173,10 @@ def _shapes(env: EnvBase, step: TensorDictBase) -> Iterator[Finding]:
     for key, spec in specs.items():
         value = step["next"].get(key, None)
         if value is None:
-            yield _wrong(f"{key!r} has a spec, but is not written", "agents that read it fail")
+            yield wrong(f"{key!r} has a spec, but is not written", "agents that read it fail")
         elif (value.shape, value.dtype) != (spec.shape, spec.dtype):
             text = f"{key!r} must be {spec.dtype} {list(spec.shape)} as its spec says, got {value.dtype} "
-            yield _wrong(text + f"{list(value.shape)}", "agents that read it fail")
+            yield wrong(text + f"{list(value.shape)}", "agents that read it fail")
 
 
 def _column(rollout: Rollout, key: str) -> Tensor:
@@ -200,13 +189,13 @@ def _ends(rollout: Rollout, task: Task) -> Iterator[Finding]:
     if keys.TRUNCATED in rollout[0]["next"]:
         over = over | _column(rollout, keys.TRUNCATED)
     if (done != over).any():
-        yield _wrong("'done' must be 'terminated' or 'truncated', and is not", "values are bootstrapped wrongly")
+        yield wrong("'done' must be 'terminated' or 'truncated', and is not", "values are bootstrapped wrongly")
     longest = task.max_steps
     length = torch.zeros(done.shape[1], dtype=torch.int64)
     for ended in done.cpu():
         length += 1
         if longest is not None and (length >= longest).logical_and(~ended).any():
-            yield _wrong(f"an episode went on after max_steps={longest}", "evaluations fail, v3 misses its end")
+            yield wrong(f"an episode went on after max_steps={longest}", "evaluations fail, v3 misses its end")
             return
         length[ended] = 0
 
@@ -223,7 +212,7 @@ def _returns(rollout: Rollout, task: Task) -> Iterator[Finding]:
             continue
         rewards = _column(rollout, key)
         if not rewards.isfinite().all():
-            yield _wrong(f"{key!r} must be finite, and is not", "training stops")
+            yield wrong(f"{key!r} must be finite, and is not", "training stops")
             return
         total, whole = torch.zeros_like(rewards[0]), torch.zeros_like(done[0])
         for reward, ended in zip(rewards.flip(0), done.flip(0), strict=True):
@@ -231,7 +220,7 @@ def _returns(rollout: Rollout, task: Task) -> Iterator[Finding]:
             total = reward + torch.where(ended, 0.0, total)
             if (whole & ((total > most + _TOLERANCE) | (total < least - _TOLERANCE))).any():
                 text = f"the sum of {key!r} must lie in [{least:g}, {most:g}] as the task says, and does not"
-                yield _wrong(text, "targets are cut off at the wrong bound")
+                yield wrong(text, "targets are cut off at the wrong bound")
                 return
 
 
@@ -246,12 +235,12 @@ def _attained(rollout: Rollout, subgoals: SubgoalSet) -> Iterator[Finding]:
         if before is not None and (now & before).any():
             if subgoals.repeatable:
                 text = f"{key!r} must be true only in the step that attains a subgoal, and is true in the next one, too"
-                yield _wrong(text, "the reward for one subgoal is paid many times")
+                yield wrong(text, "the reward for one subgoal is paid many times")
             else:
                 text = (
                     f"{key!r} must be true once in an episode for each subgoal, as they are not repeatable, and is not"
                 )
-                yield _wrong(text, "subgoals that are left are not chosen; or the reward is paid many times")
+                yield wrong(text, "subgoals that are left are not chosen; or the reward is paid many times")
             return
         kept = now if subgoals.repeatable or before is None else now | before
         before = kept & ~done
@@ -259,9 +248,9 @@ def _attained(rollout: Rollout, subgoals: SubgoalSet) -> Iterator[Finding]:
 
 def _seeds(first: Rollout, again: Rollout, other: Rollout) -> Iterator[Finding]:
     if not _same(first, again):
-        yield _wrong("the same seed must give the same worlds, and does not", "evaluations can't be repeated")
+        yield wrong("the same seed must give the same worlds, and does not", "evaluations can't be repeated")
     elif _same(first, other) and _is_random(first):
-        yield _wrong("another seed must give other worlds, and does not", "all seeds of a study are one")
+        yield wrong("another seed must give other worlds, and does not", "all seeds of a study are one")
 
 
 def _same(first: Rollout, second: Rollout) -> bool:
@@ -287,7 +276,7 @@ def _round_trip(env: EnvBase) -> Iterator[Finding]:
     tensordict = env.step_and_maybe_reset(env.rand_action(env.reset()))[1]
     state = deepcopy(base.state_dict())
     if not state:
-        yield _missing("state_dict() returns nothing", "no resume: a training that was stopped begins anew")
+        yield missing("state_dict() returns nothing", "no resume: a training that was stopped begins anew")
         return
     rollouts = []
     for _ in range(2):
@@ -295,6 +284,4 @@ def _round_trip(env: EnvBase) -> Iterator[Finding]:
         with own_random_numbers(0):
             rollouts.append(_go_on(env, tensordict.clone(), _GO_ON))
     if not _same(*rollouts):
-        yield _wrong(
-            "state_dict() must hold all there is, random numbers too, and does not", "resumed trainings differ"
-        )
+        yield wrong("state_dict() must hold all there is, random numbers too, and does not", "resumed trainings differ")

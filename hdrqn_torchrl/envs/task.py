@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Integral, Real
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from tensordict import NestedKey
+from tensordict.utils import is_seq_of_nested_key
 from torch.nn import Module
 from torchrl.envs import EnvBase
 from torchrl.envs.batched_envs import BatchedEnvBase
@@ -17,6 +19,7 @@ from torchrl.envs.transforms import StepCounter, TransformedEnv
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
+from hdrqn_torchrl.envs.subgoals import SubgoalSet, check_flag, check_names, check_sets
 from hdrqn_torchrl.transforms import Critic
 
 if TYPE_CHECKING:
@@ -31,43 +34,6 @@ class SceneFactory(Protocol):
     def __call__(self, env: EnvBase, *, subgoal: int | None = None, action: int | None = None) -> Scene:
         """See :func:`~hdrqn_torchrl.rendering.scene_of`."""
         ...
-
-
-@dataclass(frozen=True, kw_only=True)
-class SubgoalSet:
-    """One set of subgoals of a task, and the prefix of the entries that an environment writes for it.
-
-    The environment writes ``attained`` ``[N, G]`` and, if not all of them are worth choosing at all times,
-    ``available`` ``[N, G]``, under the names of :class:`~hdrqn_torchrl.keys.OptionKeys`.
-
-    Args:
-        names: of its subgoals.
-        prefix: of its entries; empty for the farthest set.
-        repeatable: whether a subgoal can be attained more than once in an episode.
-
-    Raises:
-        ValueError: if there are no subgoals.
-
-    Examples:
-        >>> SubgoalSet(names=("north", "south"), prefix="rooms").keys.attained
-        'rooms_attained'
-    """
-
-    names: tuple[str, ...]
-    prefix: str = ""
-    repeatable: bool = False
-
-    def __post_init__(self) -> None:
-        if not self.names:
-            raise ValueError("names must be those of at least one subgoal, got none; leave the set out.")
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @property
-    def keys(self) -> keys.OptionKeys:
-        """Names of its entries."""
-        return keys.OptionKeys(self.prefix)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +86,7 @@ class Task:
             tells where on it the agent is.
 
     Raises:
-        ValueError: if a number breaks its rule, or the ceiling is none of the references.
+        ValueError: if an argument breaks its rule.
 
     Examples:
         >>> Task(max_steps=50, largest_return=2.0).largest_return
@@ -141,15 +107,17 @@ class Task:
     screen: Callable[[EnvBase], NDArray[np.uint8]] | None = None
 
     def __post_init__(self) -> None:
-        if self.max_steps is not None and self.max_steps < 1:
-            raise ValueError(f"max_steps must be >= 1 or None, got {self.max_steps}; None: unknown.")
-        if not self.smallest_extrinsic_return <= self.largest_extrinsic_return:
-            raise ValueError(
-                f"smallest_extrinsic_return must be <= largest_extrinsic_return={self.largest_extrinsic_return}, got "
-                f"{self.smallest_extrinsic_return}; leave out what is not known."
-            )
-        if self.ceiling is not None and self.ceiling not in self.references:
-            raise ValueError(f"ceiling must be one of the references {sorted(self.references)}, got {self.ceiling!r}.")
+        _check_length(self.max_steps)
+        _check_bounds(self.largest_return, self.smallest_extrinsic_return, self.largest_extrinsic_return)
+        object.__setattr__(self, "subgoals", check_sets(self.subgoals))
+        object.__setattr__(self, "actions", check_names("actions", self.actions))
+        check_flag("ordered", self.ordered)
+        if not (isinstance(self.success, str) or is_seq_of_nested_key([self.success])):
+            raise ValueError(f'success must be the name of an entry, got {self.success!r}; use "success".')
+        for name, drawing in (("scene", self.scene), ("screen", self.screen)):
+            if drawing is not None and not callable(drawing):
+                raise ValueError(f"{name} must be a function or None, got {drawing!r}; None: there is none.")
+        _check_references(self.references, self.ceiling)
 
     def within(self, max_steps: int | None) -> Task:
         """The same task with episodes that are cut off after ``max_steps`` steps, if not before."""
@@ -160,6 +128,40 @@ class Task:
     def without_references(self) -> Task:
         """The same task for which scripted players don't play."""
         return replace(self, references={}, ceiling=None)
+
+
+def _check_length(max_steps: int | None) -> None:
+    whole = isinstance(max_steps, Integral) and not isinstance(max_steps, bool)
+    if max_steps is not None and not (whole and max_steps >= 1):
+        raise ValueError(f"max_steps must be a whole number >= 1 or None, got {max_steps!r}; None: unknown.")
+
+
+def _check_bounds(largest: float, smallest_extrinsic: float, largest_extrinsic: float) -> None:
+    bounds = {
+        "largest_return": largest,
+        "smallest_extrinsic_return": smallest_extrinsic,
+        "largest_extrinsic_return": largest_extrinsic,
+    }
+    for name, bound in bounds.items():
+        if not isinstance(bound, Real) or math.isnan(bound):
+            raise ValueError(f"{name} must be a number, got {bound!r}; leave out what is not known.")
+    if smallest_extrinsic > largest_extrinsic:
+        raise ValueError(
+            f"smallest_extrinsic_return must be <= largest_extrinsic_return={largest_extrinsic}, got "
+            f"{smallest_extrinsic}; leave out what is not known."
+        )
+
+
+def _check_references(references: Mapping[str, Reference], ceiling: str | None) -> None:
+    known = isinstance(references, Mapping) and all(isinstance(each, Reference) for each in references.values())
+    if not known:
+        raise ValueError(
+            f'references must be {{"name": Reference(...)}}, got {references!r}; leave out what there is not.'
+        )
+    if ceiling is not None and ceiling not in references:
+        raise ValueError(
+            f"ceiling must be one of the references {sorted(references)}, got {ceiling!r}; None: there is no line."
+        )
 
 
 def task_of(env: EnvBase) -> Task:

@@ -1,6 +1,7 @@
 """Environments with one fault each are told of it; the project's own have none."""
 
 import re
+from dataclasses import replace
 
 import pytest
 import torch
@@ -125,7 +126,12 @@ def test_a_whole_task_without_players_and_picture_does_without_a_ceiling_line():
         (corridor(Standing), "'attained' must be true only in the step that attains a subgoal"),
         (corridor(task=Task(subgoals=(SubgoalSet(names=("a", "b")),))), "'attained' must be true once in an episode"),
         (corridor(task=Task(subgoals=(SubgoalSet(names=("a",)),))), r"'attained' must be torch.bool \[4, 1\]"),
-        (corridor(task=Task(subgoals=(SubgoalSet(names=("a",), prefix="near"),))), "'near_attained' is missing"),
+        (
+            corridor(task=Task(subgoals=(SubgoalSet(names=("a",), prefix="near"), *WHOLE.subgoals))),
+            "'near_attained' is missing",
+        ),
+        (corridor(task=replace(WHOLE, actions=("left",))), "the task must name 2 actions, or none, and names 1"),
+        (corridor(task={"max_steps": 6}), "'task' must be a Task, got {'max_steps': 6}"),
         (corridor(odd={"attained": Unbounded((4, 2))}), r"'attained' must be torch.bool \[4, 2\], got torch.float32"),
         (corridor(odd={"hazard": Binary(shape=(4,), dtype=torch.bool)}), r"'hazard' must be torch.bool \[4, 1\]"),
         (corridor(Endless), "an episode went on after max_steps=6"),

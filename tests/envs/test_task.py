@@ -84,13 +84,24 @@ class TestWhatIsFound:
 @pytest.mark.parametrize(
     "settings, message",
     [
-        ({"max_steps": 0}, "max_steps must be >= 1 or None, got 0"),
+        ({"max_steps": 0}, "max_steps must be a whole number >= 1 or None, got 0"),
+        ({"max_steps": "400"}, "max_steps must be a whole number >= 1 or None, got '400'"),
+        ({"max_steps": 2.5}, "max_steps must be a whole number >= 1 or None, got 2.5"),
+        ({"largest_return": math.nan}, "largest_return must be a number, got nan; leave out what is not known."),
+        ({"largest_return": None}, "largest_return must be a number, got None; leave out what is not known."),
+        ({"smallest_extrinsic_return": "0"}, "smallest_extrinsic_return must be a number, got '0'"),
+        ({"ordered": "yes"}, "ordered must be True or False, got 'yes'"),
+        ({"success": 3}, "success must be the name of an entry, got 3"),
+        ({"actions": "up"}, "actions must be different texts, none of them empty, got 'up'"),
+        ({"scene": "picture"}, "scene must be a function or None, got 'picture'"),
+        ({"references": {"hero": 2.0}}, "references must be {.*}, got {'hero': 2.0}"),
+        ({"ceiling": "hero"}, r"ceiling must be one of the references \[\], got 'hero'"),
         (
             {"largest_extrinsic_return": -1.0, "smallest_extrinsic_return": 0.0},
             "smallest_extrinsic_return must be <= largest_extrinsic_return=-1.0, got 0.0",
         ),
     ],
 )
-def test_contradictions_are_refused(settings, message):
+def test_what_can_not_be_so_is_refused_where_it_is_stated(settings, message):
     with pytest.raises(ValueError, match=message):
         Task(**settings)

@@ -12,7 +12,8 @@ from torchrl.envs import EnvBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.grid.measured import measured
 from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules
-from hdrqn_torchrl.envs.task import Figures, Reference, SubgoalSet, Task
+from hdrqn_torchrl.envs.subgoals import SubgoalSet
+from hdrqn_torchrl.envs.task import Figures, Reference, Task
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.envs.scene import Scene

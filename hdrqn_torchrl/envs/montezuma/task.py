@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.envs.montezuma.screen import ACTION_NAMES, ALL_ACTIONS
-from hdrqn_torchrl.envs.task import SubgoalSet, Task
+from hdrqn_torchrl.envs.subgoals import SubgoalSet
+from hdrqn_torchrl.envs.task import Task
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.envs.scene import Scene
