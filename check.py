@@ -1,4 +1,4 @@
-"""Checks whether an environment keeps the contract of tasks, and says what each fault or gap costs."""
+"""Checks whether an environment fulfils the contract for tasks, and says what each fault or gap costs."""
 
 from hdrqn_torchrl.cli.check import main
 

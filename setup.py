@@ -1,6 +1,6 @@
-"""Which packages a wheel holds: those of the project, and ``conf/``, which lies at the top of a checkout.
+"""The packages of a wheel: those of the project, and ``conf/``, which lies at the top of a checkout.
 
-The rest stands in pyproject.toml, whose table of packages can't find some and name others.
+The rest is in pyproject.toml, whose table of packages can't both find some and name others.
 """
 
 from setuptools import find_packages, setup

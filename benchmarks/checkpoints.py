@@ -54,7 +54,7 @@ def resident() -> int:
 
 
 def main() -> None:
-    """Fills the memories, trains for a while, saves several times."""
+    """Fills the memories, trains for a while and saves several times."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--algo", choices=BUILDERS, default="v2")
     parser.add_argument("--saves", type=int, default=5)

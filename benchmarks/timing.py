@@ -1,6 +1,6 @@
-"""Timing in turns, in processor time: on a shared machine little else means something.
+"""Timing in turns, in processor time: on a shared machine hardly any other measure is reliable.
 
-Both functions run on one thread and wait for nothing, so on an idle core processor time is wall time.
+Both functions run on one thread and never wait, so on an idle core processor time is wall time.
 """
 
 from __future__ import annotations

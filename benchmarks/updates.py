@@ -89,7 +89,7 @@ class RawLearner:
         self.optimizer = torch.optim.Adam(self.parameters, lr=LEARNING_RATE, fused=True)
 
     def loss(self, batch: Batch) -> Tensor:
-        """Mean squared TD error over the trained steps of sequences of T + 1; the last only shows what came of T."""
+        """Mean squared TD error over the trained steps of sequences of T + 1; the last one shows what came of T."""
         valid, init = batch["valid"], batch["init"] & batch["valid"]
         stream, subgoal = batch["observation"], batch.get("condition")
         restart = None if subgoal is None else init

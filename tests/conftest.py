@@ -9,7 +9,7 @@ torch.set_num_threads(1)
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory, monkeypatch):
-    """What scripted players achieve is kept for one run of the tests, away from the user's own."""
+    """Results of scripted players are kept for one run of the tests, apart from the user's own."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp() / "cache"))
 
 

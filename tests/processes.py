@@ -107,7 +107,7 @@ def leftovers(folder: Path) -> int:
     """Number of bytes in a run folder that belong to no checkpoint or log."""
     stray = [*folder.glob("checkpoints/.*"), *folder.glob("*.partial")]
     files = [file for path in stray for file in (path, *path.rglob("*")) if file.is_file()]
-    return sum(file.stat().st_size for file in files) + len(stray)  # an empty file or folder is one, too
+    return sum(file.stat().st_size for file in files) + len(stray)  # an empty file or folder counts, too
 
 
 def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None:

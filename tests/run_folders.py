@@ -1,4 +1,4 @@
-"""Run folders with small settings, and with some that mean harm."""
+"""Run folders with small settings, and with hostile ones."""
 
 import json
 from functools import cache

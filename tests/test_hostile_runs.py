@@ -324,7 +324,7 @@ ATTACKS = {
     ("name", "reader"),
     [(name, reader) for name, (_, readers) in ATTACKS.items() for reader in readers],
 )
-@pytest.mark.filterwarnings("ignore:.*passed over")
+@pytest.mark.filterwarnings("ignore:.*is skipped")
 def test_programs_refuse_a_hostile_run_in_one_sentence(run, capsys, name, reader):
     ATTACKS[name][0](run)
     with at_once(), pytest.raises((SettingsError, RunError, CheckpointError)) as refusal:

@@ -186,7 +186,7 @@ def test_many_random_configurations_train_or_are_refused_with_a_clear_error(firs
         ("algo.sub.batch_size=1.5", "algo.sub.batch_size must be an integer, got 1.5"),
         ("algo.max_option_steps=[1]", "algo.max_option_steps must be an integer or null, got [1]"),
         ("checkpoint.interval_frames=[1]", "checkpoint.interval_frames"),
-        ("++evaluation.env={num_goals: 3}", "evaluation.env must leave what the agent sees and does as it is"),
+        ("++evaluation.env={num_goals: 3}", "evaluation.env must not change what the agent sees or does"),
         ("env.view=abc", "env.view must be an integer or null, got 'abc'"),
         ("network.widths=[x]", "network.widths must be a list of integers, got ['x']"),
         ("algo.meta.burn_in=1.5", "algo.meta.burn_in must be in [0, 1), got 1.5"),

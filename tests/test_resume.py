@@ -317,7 +317,7 @@ def test_a_checkpoint_without_memories_resumes_with_empty_ones(training, tmp_pat
     trainer._saved_position = None
     trainer.save()
     trainer = resume(build, tmp_path, total_frames=frames + 160)
-    assert "holds no replay memory: it begins empty and is warmed up anew" in trainer.logger.console.file.getvalue()
+    assert "holds no replay memory: it begins empty and is warmed up again" in trainer.logger.console.file.getvalue()
     assert (trainer.frames, trainer.updates) == (frames, updates)
     assert all((value == expected[key]).all() for key, value in trainer.algorithm.policy.state_dict().items())
     made = {name: learner.updates for name, learner in trainer.algorithm.learners.items()}

@@ -1,1 +1,1 @@
-"""What many runs say together: results read back, estimates over seeds, claims, figures."""
+"""Analysis of many runs: results read back, estimates over seeds, claims, figures."""

@@ -1,4 +1,4 @@
-"""Archives of what came out of runs: settings and measurements without weights, in one file that can be kept."""
+"""Archives of the results of runs: settings and measurements without weights, in one file that can be kept."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LARGEST_ARCHIVE = 256 << 20
 
 
 class _Bounded:
-    """A compressed file that ends with an error when more comes out of it than any report keeps."""
+    """A compressed file whose reading fails once it yields more than any report keeps."""
 
     def __init__(self, path: Path) -> None:
         self._file, self._left = lzma.open(path), LARGEST_ARCHIVE  # noqa: SIM115  (it goes with this object)
@@ -29,7 +29,7 @@ class _Bounded:
 
 
 def unpack(archive: Path, folder: Path) -> None:
-    """Takes the files that :func:`keep` puts into an archive out of it, and refuses one that holds anything else."""
+    """Unpacks the files that :func:`keep` puts into an archive, and refuses one that holds anything else."""
     with tarfile.open(fileobj=_Bounded(archive), mode="r|") as members:  # type: ignore[call-overload]
         for member in members:
             place = PurePosixPath(member.name)

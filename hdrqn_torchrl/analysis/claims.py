@@ -1,9 +1,9 @@
-"""Claims about groups of runs, held against their final results.
+"""Claims about groups of runs, checked against their final results.
 
 A claim is decided by 95 % intervals of means and of their differences
-(:mod:`~hdrqn_torchrl.analysis.intervals`), and ``open`` as long as these leave both ways: of claims about equal groups
-no more than about 5 % are decided. Each claim counts for itself; of twenty about equal groups, one may be decided
-wrongly. One seed decides nothing.
+(:mod:`~hdrqn_torchrl.analysis.intervals`), and ``open`` as long as these allow both outcomes: of claims about equal
+groups no more than about 5 % are decided. Each claim is tested by itself; of twenty about equal groups, one may be
+decided wrongly. One seed decides nothing.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ class Verdict:
 
     claim: str
     outcome: str
-    """``agrees``, ``disagrees``, or ``open`` where the seeds do not tell; says if that is for want of a second one."""
+    """``agrees``, ``disagrees``, or ``open`` where the seeds do not decide; notes a missing second seed."""
     measured: str
-    """Means of the groups, with the reach of their intervals to either side."""
+    """Means of the groups, with the half-widths of their intervals."""
 
 
 class Claim(Protocol):
-    """Something that can be held against results."""
+    """Something that can be checked against results."""
 
     @property
     def row(self) -> str | None:
-        """The row of a study that it is about; ``None``: its only one."""
+        """The row of a study that it refers to; ``None``: its only one."""
 
     def check(self, results: Results) -> Verdict | None:
         """``None`` if groups that it is about have no results yet."""

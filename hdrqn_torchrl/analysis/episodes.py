@@ -1,4 +1,4 @@
-"""What the episodes of one evaluation say: averages with intervals, and what became of each subgoal."""
+"""Summary of the episodes of one evaluation: averages with intervals, and results for each subgoal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hdrqn_torchrl.runs.evaluation import columns
 
 
 def summarise(played: TensorDictBase, *, confidence: float = CONFIDENCE) -> dict[str, Any]:
-    """Averages with intervals over episodes, and what became of each subgoal.
+    """Averages with intervals over episodes, and results for each subgoal.
 
     Args:
         played: episodes of :func:`play`.
@@ -21,7 +21,7 @@ def summarise(played: TensorDictBase, *, confidence: float = CONFIDENCE) -> dict
 
     Returns:
         The entries of :func:`evaluate`; ``intervals``: the same names with ``[low, high]``, of rates after Clopper and
-        Pearson, else t intervals, or ``None`` where all episodes were alike; ``per_subgoal``: for each
+        Pearson, else t intervals, or ``None`` where all episodes had the same value; ``per_subgoal``: for each
         subgoal ``attained`` (share of episodes in which it was) and, for hierarchical agents, ``options`` (per
         episode) and ``success_rate`` (share of its options that reached it; ``None`` if it was never chosen).
     """

@@ -61,7 +61,7 @@ class TaskResults:
 
 
 def align(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Curves on common positions, by linear interpolation inside each one's own range, NaN outside.
+    """Curves on common positions, by linear interpolation inside the range of each, NaN outside.
 
     The common positions are all those of any curve. If these are more than twice those of the longest curve (clocks
     never agree), they are as many as the longest has, evenly spaced.
@@ -178,8 +178,8 @@ def estimate_finals(
 ) -> dict[str, Estimate]:
     """Each column's estimate over the runs' final values, at one position; see :func:`estimate_curves`.
 
-    A time until a level was reached has an estimate only if all runs did: those that were quick enough to be seen are
-    no sample of all.
+    A time until a level was reached has an estimate only if all runs did: those that were quick enough to get there
+    are not a fair sample.
     """
     estimates = {}
     for column in columns:

@@ -28,7 +28,7 @@ class Entry:
     run: Run
     settings: dict[str, Any] = field(default_factory=dict)
     choices: dict[str, str] = field(default_factory=dict)
-    """Which file of each group of conf/ the settings were composed of."""
+    """The file of each group of conf/ that the settings were composed from."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def value_of(entry: Entry, key: str) -> str:
 
 
 def differences(entries: Sequence[Entry]) -> list[str]:
-    """Settings beside task and seed in which runs differ, outermost first."""
+    """Settings besides task and seed in which runs differ, outermost first."""
     found = [_compared(entry.settings) for entry in entries]
     keys = dict.fromkeys(key for each in found for key in each)
     return sorted(
@@ -117,7 +117,7 @@ def _compared(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _labels(entries: Sequence[Entry], by: Sequence[str]) -> list[str]:
-    """Label of each run's group: names of files of conf/ as they are, settings with the shortest name that tells."""
+    """Label of each run's group: names of files of conf/ as they are, settings with the shortest unambiguous name."""
     if not by:
         return ["all"] * len(entries)
     short = Counter(key.rpartition(".")[2] for key in by)
@@ -159,7 +159,7 @@ def _titles(tasks: Sequence[Sequence[Entry]], without: Set[str]) -> list[str]:
 
 
 def _guessed_choice(group: str, settings: dict[str, Any]) -> str:
-    """What a part of the settings is called where a run folder does not say which file of conf/ it was."""
+    """A name for a part of the settings where a run folder does not say which file of conf/ it came from."""
     builder = str(settings["_target_"]).rpartition(".")[2]
     if group == "env" and isinstance(layout := settings.get("layout"), str):
         return {"open": "gridworld"}.get(layout, layout)
@@ -181,6 +181,6 @@ def _text(value: Any) -> str:
 
 
 def _natural(label: str) -> list[tuple[int, float, str]]:
-    """Sorts numbers in a text by their size."""
+    """Sort key that orders numbers in a string by value."""
     parts = re.split(r"(\d+(?:\.\d+)?)", label)
     return [(1, float(part), "") if index % 2 else (0, 0.0, part) for index, part in enumerate(parts)]

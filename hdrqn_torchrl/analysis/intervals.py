@@ -1,8 +1,9 @@
-"""Confidence intervals that hold for few values, as there are of seeds.
+"""Confidence intervals that are valid for few values, such as one per seed.
 
-All are t intervals. A bootstrap over n seeds is too narrow: percentiles of resampled means hold the true mean of normal
-values in 50, 74, 84 and 90 % of cases with 2, 3, 5 and 10 seeds where they say 95 %, BCa does no better. t intervals
-hold it in 95 % with any number; of skewed, bounded values like ours (returns near their ceiling) in 92 to 94 %.
+All are t intervals. A bootstrap over n seeds is too narrow: percentiles of resampled means cover the true mean of
+normal values in 50, 74, 84 and 90 % of cases with 2, 3, 5 and 10 seeds at a nominal 95 %; BCa does no better. t
+intervals cover it in 95 % with any number; of skewed, bounded values like ours (returns near their ceiling) in 92 to
+94 %.
 (``tests/test_intervals.py``.)
 """
 
@@ -27,8 +28,8 @@ def mean_interval(values: Array, *, confidence: float = CONFIDENCE) -> tuple[Arr
         confidence: level of the interval.
 
     Returns:
-        Low and high ``[*]``. NaN where R < 2 or all values are equal: that a few are tells nothing about how far others
-        would be from them.
+        Low and high ``[*]``. NaN where R < 2 or all values are equal: a few equal values say nothing about the spread
+        of others.
 
     Examples:
         >>> low, high = mean_interval(np.array([1.0, 2.0, 3.0]))
@@ -107,7 +108,7 @@ def _t_interval(
 
 
 def share_interval(share: float, number: int, *, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Interval of a share of independent cases (Clopper and Pearson): one at 0 or 1 has a width, too.
+    """Interval of a share of independent cases (Clopper and Pearson), which has a width even at 0 or 1.
 
     Args:
         share: in [0, 1].

@@ -46,7 +46,7 @@ def plot_run(
         axis.grid(alpha=0.3)
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="lower right")
-    figure.suptitle(title.replace("$", r"\$"))  # it names what a run was composed of
+    figure.suptitle(title.replace("$", r"\$"))  # it names what a run was composed from
     figure.savefig(path, dpi=110)
 
 

@@ -59,7 +59,7 @@ def find_runs(patterns: Iterable[str]) -> list[Path]:
 
 
 def _runs_below(place: Path) -> Iterator[Path]:
-    """Run folders at or below a folder; links to run folders count, others are not followed: they may lead round."""
+    """Run folders at or below a folder; links to run folders count, others are not followed: they may be circular."""
     for folder, inner, files in os.walk(place):
         if layout.METRICS in files:
             yield Path(folder)
@@ -99,7 +99,7 @@ def read_run(folder: Path) -> Run:
     """Reads one run folder.
 
     Where rows were logged twice, because the run was resumed from an earlier point, the later ones count. A summary
-    that is older than the last row (of a run that was ended and then resumed) counts as none.
+    that is older than the last row (of a run that was ended and then resumed) is ignored.
 
     Raises:
         ValueError: if a file is broken, or there is no complete log point yet.
@@ -110,7 +110,7 @@ def read_run(folder: Path) -> Run:
     if not len(frames):
         raise ValueError(f"{folder / layout.METRICS} has no complete log point (a row with its frames) yet.")
     if not np.isfinite(frames).all():
-        raise ValueError(f"{folder / layout.METRICS} must tell the frames of every row, got {frames.tolist()[:10]}.")
+        raise ValueError(f"{folder / layout.METRICS} must hold the frames of every row, got {frames.tolist()[:10]}.")
     kept = frames <= _least_from_here(frames)
     return Run(
         folder,
@@ -198,12 +198,12 @@ def is_share(column: str) -> bool:
 
 
 def asks_for_a_time(column: str) -> bool:
-    """Whether a final value says when a level was reached: a run that never does has none, which is no gap in it."""
+    """Whether a final value says when a level was reached: a run that never does has none, and is complete."""
     return _UNTIL.fullmatch(column) is not None
 
 
 def final_value(run: Run, column: str) -> float:
-    """What a run came to.
+    """A run's final value of a column.
 
     Args:
         run: the run.

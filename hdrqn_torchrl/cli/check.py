@@ -1,11 +1,11 @@
-"""Checks whether an environment keeps the contract of tasks, and says what each fault or gap costs.
+"""Checks whether an environment fulfils the contract for tasks, and says what each fault or gap costs.
 
     python check.py env=gridworld
     python check.py env=mine --config-dir my_conf allowed_targets=[my_package.MyEnv]
     python check.py env._target_=my_package.MyEnv allowed_targets=[my_package.MyEnv]
 
-The arguments are those of a training; seed and env are read. Four worlds are stepped with random actions. The exit code
-is 1 if something is wrong that prevents training, else 0. docs/own_tasks.md explains the contract.
+Takes the arguments of a training, of which it uses seed and env. Four worlds are stepped with random actions. The exit
+code is 1 if something is wrong that prevents training, else 0. docs/own_tasks.md explains the contract.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def composed(arguments: list[str]) -> RunSettings:
 
 
 def check_settings(settings: RunSettings) -> list[str]:
-    """What is wrong with the environment of some settings, or missing in it."""
+    """Faults and gaps of the environment that the settings describe."""
     from hdrqn_torchrl.envs import check_task  # takes seconds: it loads torch
 
     changes = {"seed": settings.seed, "device": "cpu", "num_envs": WORLDS}

@@ -35,7 +35,7 @@ def check_place(path: Path, key: str) -> None:
 
 
 def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
-    """Calls ``run`` with an instance of ``schema`` filled from ``key=value`` arguments; ends with a message if wrong.
+    """Calls ``run`` with an instance of ``schema`` filled from ``key=value`` arguments; exits with a message on errors.
 
     Args:
         schema: dataclass of the settings; ``MISSING`` marks those that must be given.
@@ -65,9 +65,9 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
 
 
 def _is_text(schema: type, key: str, value: str) -> bool:
-    """Whether a value is meant as it stands, and not as YAML: ``#``, ``:``, ``*`` and ``null`` are parts of names, too.
+    """Whether a value is taken literally and not as YAML: file names may contain ``#``, ``:``, ``*`` or ``null``.
 
-    Settings of any type (``runs``, ``out``) take a text or a ``[list]``.
+    Settings of any type (``runs``, ``out``) take a string or a ``[list]``.
     """
     hint = get_type_hints(schema).get(key)
     if hint is Any:

@@ -20,11 +20,11 @@ CONF = next(folder for folder in (_PACKAGE / "conf", _PACKAGE.parent / "conf") i
 
 
 class RunError(RuntimeError):
-    """A training that could not go on, in words for its user."""
+    """Why a training could not go on, in words for its user."""
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """What one's own command line composed, with every reference followed, once: plain data from here on.
+    """The settings composed by the user's command line, every reference resolved once: plain data from here on.
 
     Raises:
         SettingsError: if a reference leads nowhere, or a value is missing.

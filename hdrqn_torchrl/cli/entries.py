@@ -1,4 +1,4 @@
-"""Runs read back with what they were started with, and what scripted players achieve on their tasks."""
+"""Runs read back with the settings they were started with, and the results of scripted players on their tasks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BROKEN = (ValueError, TypeError, KeyError, OSError)
 
 
 def note(text: str) -> None:
-    """Something that the reader of the figure should know."""
+    """Prints something that the reader of the figure should know."""
     print(text, file=sys.stderr)
 
 
@@ -78,7 +78,7 @@ def references_of(entry: Entry, ceilings: str) -> References:
 def players(settings: str, *, simulate: bool) -> References:
     """What the scripted players achieve on a task, given as JSON; empty if that is not known."""
     task = json.loads(settings)
-    if task.get(TARGET) not in BUILDERS["env"]:  # one's own: nobody has said that it can be trusted
+    if task.get(TARGET) not in BUILDERS["env"]:  # a user's own: nobody has declared it trusted
         return {}
     from hdrqn_torchrl.envs import task_of as stated_by  # takes seconds: it loads torch
     from hdrqn_torchrl.runs.building import build
@@ -86,6 +86,6 @@ def players(settings: str, *, simulate: bool) -> References:
 
     try:
         env = build(task | {"num_envs": 1}, place="env")
-    except SettingsError:  # what it needs is not installed, or another version's
+    except SettingsError:  # something it needs is missing, or of another version
         return {}
     return references_for(stated_by(env), play=simulate, tell=note)

@@ -11,16 +11,16 @@
                     chosen in the worlds of evaluation.seed itself: there it looks better than it is
     max_steps       steps after which an episode is cut off, if it has not ended (the run's evaluation.max_steps)
     epsilon         probability of a random choice, at each level (0: greedy)
-    env.KEY         setting of the task that shall differ from the run's, e.g. env.view=3 env.layout=four_rooms
+    env.KEY         setting of the task to change from the run's, e.g. env.view=3 env.layout=four_rooms
     out             file to write the object to as well
     figures         folder for pictures: how often options lead from one subgoal to another (legs.png) and, where
                     there is a screen, where the agent was (places.png)
-    ceilings        what scripted players achieve (true); where nobody has measured it they play, ...
-    ceiling_seconds ... each for so long at most (the run's evaluation.ceiling_seconds)
-    allowed_targets own builders that the run's settings may name, e.g. [my_package.MyEnv]
+    ceilings        report what scripted players achieve (true); where that has not been measured, they play first
+    ceiling_seconds time limit for each of these players (the run's evaluation.ceiling_seconds)
+    allowed_targets builders of your own that the run's settings may name, e.g. [my_package.MyEnv]
 
 Each figure is a mean over episodes. "intervals" are 95 % intervals over the episodes of this one agent (t; of rates
-Clopper and Pearson's; null where all episodes were alike): they do not say how agents of other seeds would do.
+Clopper and Pearson's; null where all episodes had the same value): they do not say how agents of other seeds would do.
 "references" are what scripted players achieve on the same task, if it has any, and "ceiling" is the return of one of
 them (on the grids: "memory", which has the agent's own view; "egocentric" must also find out where it is).
 """
@@ -71,7 +71,9 @@ def run(settings: Settings) -> None:
         if getattr(settings, name) < least:
             raise SettingsError(f"{name} must be >= {least}, got {getattr(settings, name)}.")
     if settings.seed is not None and settings.seed < 0:
-        raise SettingsError(f"seed must be >= 0, got {settings.seed}; without it the run's summary has them.")
+        raise SettingsError(
+            f"seed must be >= 0, got {settings.seed}; leave it out for the seed of the run's own summary."
+        )
     if not 0.0 <= settings.epsilon <= 1.0:
         raise SettingsError(f"epsilon must lie in [0, 1], got {settings.epsilon}; 0 is greedy.")
     if settings.out is not None:
@@ -80,7 +82,7 @@ def run(settings: Settings) -> None:
         check_place(Path(settings.figures) / "legs.png", "figures")
     played, agent, observers = evaluate_run(settings)
     result = json.dumps(played, indent=2)
-    print(result, flush=True)  # first: nothing that comes now can lose it
+    print(result, flush=True)  # first: no later error can lose it
     try:
         if settings.out is not None:
             Path(settings.out).write_text(result + "\n")
@@ -91,7 +93,7 @@ def run(settings: Settings) -> None:
 
 
 def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, Any]]:
-    """What is printed, who played, and what was counted meanwhile."""
+    """The result to print, the agent that played, and the counts made on the way."""
     import torch
     from torchrl.envs import ExplorationType
 
@@ -144,7 +146,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
 
 
 def tell(sentence: str) -> None:
-    """Says on the terminal what takes long."""
+    """Announces slow work on the terminal."""
     print(f"{sentence}; ceilings=false leaves that out", file=sys.stderr, flush=True)
 
 

@@ -26,7 +26,7 @@ class Found:
 
     entry: Entry
     settings: dict[str, Any]
-    """By their full names, without those that nothing learned depends on."""
+    """By full name, without those that do not affect learning."""
     origin: dict[str, Any]
     """``run.json``"""
 

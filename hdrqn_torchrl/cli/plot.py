@@ -16,7 +16,7 @@ by        what makes a group: algo (default), env, network, any setting (algo.su
 center    mean (default) or iqm, the interquartile mean; either with a 95 % t interval over seeds (of the IQM after
           Tukey and McLaughlin). One seed has none, nor have equal values; of two or three it is wide, and cut off
           where it would make a panel more than twice as high
-smooth    moving average over so many log points, or over this share of a run if < 1 (default 0: none)
+smooth    moving average over this number of log points or, if < 1, this share of a run (default 0: none)
 pool      true: all tasks in one row of panels; intervals are of seeds, not of tasks (default: a row for each task)
 ceilings  known (default): scripted players where they have been measured; simulate: the others play, each for two
           minutes at most; none
@@ -24,7 +24,7 @@ log_x     true: logarithmic axis
 title     heading
 
 Runs of a group are aligned by linear interpolation and never extrapolated. A curve goes as far as half of them reach,
-and is dotted where not all do. A band holds at each position for itself, not for the curve as a whole.
+and is dotted where not all do. Bands are pointwise: each holds at its position, not for the curve as a whole.
 """
 
 from __future__ import annotations
@@ -149,20 +149,20 @@ def tell_about(label: str, entries: list[Entry], settings: Settings) -> None:
     if settings.center == "iqm" and len(entries) < 4:
         note(f"note: {label}: the IQM of fewer than 4 runs cuts nothing off and is their mean")
     if settings.kind == "bars" and (unfinished := [entry for entry in entries if not entry.run.summary]):
-        note(f"note: {label}: unfinished are {len(unfinished)} of {len(entries)} runs; their last evaluation counts")
+        note(f"note: {label}: {len(unfinished)} of {len(entries)} runs are unfinished; their last evaluation counts")
     seeds = Counter((task_key(entry), value_of(entry, "seed")) for entry in entries)
     if twice := [seed for (_, seed), number in seeds.items() if number > 1 and seed != "none"]:
         note(f"note: {label}: several runs with seed {', '.join(dict.fromkeys(twice))}; each counts as one")
     counts = Counter(task for task, _ in seeds.elements())
     if len(set(counts.values())) > 1:
         fewest, most = min(counts.values()), max(counts.values())
-        note(f"note: {label}: tasks have {fewest} to {most} runs; each run counts alike, so tasks do not")
+        note(f"note: {label}: tasks have {fewest} to {most} runs; each run has the same weight, so tasks do not")
     if differing := differences(entries):
-        note(f"note: {label} puts runs together that differ in {shortened(differing)}; by=... separates them")
+        note(f"note: {label} combines runs that differ in {shortened(differing)}; by=... separates them")
 
 
 def tell_who_is_missing(label: str, runs: list[Run], columns: list[str]) -> None:
-    """Notes about times that not all runs of a group have."""
+    """Notes about times that some runs of a group did not reach."""
     for column in filter(asks_for_a_time, columns):
         reached = sum(isfinite(final_value(run, column)) for run in runs)
         if reached < len(runs):

@@ -1,11 +1,11 @@
-"""Writes the results of the paper's studies: figures, tables and what agrees with its claims, from run folders.
+"""Writes the results of the paper's studies: figures, tables and a check of its claims, from run folders.
 
     python train.py -m experiment=gridworld sweep=parallel resume=auto output_root=outputs/studies
     python report.py runs=outputs/studies out=docs/results.md
 
 runs      folders, glob patterns or archives (.tar.xz) that an earlier report kept, several in brackets; a run belongs
           to a study if it has the settings of one of its jobs, wherever it lies
-out       text to write; its figures go to a folder of the same name. What stands in it outside of the
+out       text to write; its figures go to a folder of the same name. Whatever it holds outside the
           marked parts is left as it is
 size      small (default) or paper: which of a study's two sizes
 studies   only these: studies=gridworld,views; without it there is also an overview of all claims
@@ -104,7 +104,7 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
     experiment = study.name if settings.size == "small" else f"paper/{study.name}"
     lines = [f"`python train.py -m experiment={experiment}`"]
     if left := missing + sum(not run.entry.run.summary for _, run in found):
-        lines[0] += f" (runs that have not been made to their end yet: {left} of {missing + len(found)})"
+        lines[0] += f" (unfinished runs: {left} of {missing + len(found)})"
     if not found:
         return lines[0], []
     beside = [(job, run) for job, run in everywhere if job.overrides["algo"] in study.beside]
@@ -218,7 +218,7 @@ def table_row(label: str, members: list[Found]) -> str:
 
 
 def commits_of(members: list[Found]) -> str:
-    """Where the runs' code stood."""
+    """Commits of the code that made the runs."""
     return ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
 
 
@@ -255,7 +255,7 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
 
 
 def put(text: str, mark: str, part: str) -> str:
-    """Replaces what stands between a pair of marks, or adds both at the end.
+    """Replaces the text between a pair of marks, or adds text and marks at the end.
 
     Examples:
         >>> put("before <!-- a -->\\nold\\n<!-- end of a --> after", "a", "new")

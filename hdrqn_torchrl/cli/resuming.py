@@ -118,7 +118,7 @@ def refuse_other_algorithm(choices: dict[str, str]) -> None:
 
 
 def command(folder: Path, allowed_targets: Sequence[str] = ()) -> str:
-    """What goes on with a run, as it is to be typed: quoted for the shell and for Hydra, with what one must trust."""
+    """The command that resumes a run, quoted for the shell and for Hydra, with the targets that it must allow."""
     value = str(folder)
     if INTERPOLATION in value:
         value = os.path.relpath(folder)
@@ -133,7 +133,7 @@ def command(folder: Path, allowed_targets: Sequence[str] = ()) -> str:
 
 
 def _is_read_as_it_stands(value: str) -> bool:
-    """Whether Hydra takes a value for the text that it is; ``null``, ``007`` and ``a,b`` it does not."""
+    """Whether Hydra reads a value as plain text, unlike ``null``, ``007`` or ``a,b``."""
     try:
         return OverridesParser.create().parse_override(f"resume={value}").value() == value
     except HydraException:
@@ -210,7 +210,7 @@ def refuse_other_databases(config: RunSettings, known: Set[str]) -> None:
 
     Args:
         config: settings of a run that was read back.
-        known: those that need no word.
+        known: those that may be written to without asking.
     """
     for index, logger in enumerate(config.logger["loggers"]):
         place = logger.get("tracking_uri")
@@ -231,7 +231,7 @@ def refuse_going_back(checkpoint: Path) -> None:
 
 
 def differences(stored: Settings, config: Settings) -> list[str]:
-    """Settings that changed, one line each. Raising ``total_frames`` is none, nor is what follows it."""
+    """Settings that changed, one line each. Raising ``total_frames`` does not count, nor does what follows it."""
     before, after = (flat(_without_copies(deepcopy(each)), without=BOOKKEEPING) for each in (stored, config))
     frames = before.pop("total_frames"), after.pop("total_frames")
     changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
@@ -244,7 +244,7 @@ def differences(stored: Settings, config: Settings) -> list[str]:
 
 
 def _without_copies(settings: dict[str, Any]) -> dict[str, Any]:
-    """Leaves out what loggers are given to show: it stands elsewhere, too."""
+    """Leaves out what loggers are only given to show: it is stored elsewhere as well."""
     loggers = (settings.get("logger") or {}).get("loggers")
     for logger in loggers if isinstance(loggers, list) else []:
         if isinstance(logger, dict):

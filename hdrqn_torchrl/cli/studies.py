@@ -136,7 +136,7 @@ STUDIES = (
     ),
     Study(
         "authors_choices_3_goals",
-        "The same with three goals: what the meta level feels",
+        "The same with three goals: choices that affect the meta level",
         by=("variant",),
     ),
     Study(
@@ -173,10 +173,10 @@ class Job:
     overrides: dict[str, str]
     """What the sweep sets, as text."""
     settings: dict[str, Any]
-    """By their full names, without those that nothing learned depends on."""
+    """By full name, without those that do not affect learning."""
 
     def label(self, keys: Iterable[str]) -> str:
-        """Values of some of its overrides, names of files of conf/ as they are.
+        """Some of its overrides in short: the bare value where it names a file of conf/.
 
         Examples:
             >>> Job({"algo": "v2", "algo.sub.slice_len": "8"}, {}).label(["algo", "algo.sub.slice_len"])
@@ -218,8 +218,8 @@ def jobs_of(experiment: str) -> list[Job]:
 def is_run_of(job: Job, run: dict[str, Any]) -> bool:
     """Whether a run was trained with a job's settings.
 
-    Settings that are newer than the run are not asked for, nor what the job leaves to the task: older runs have that as
-    numbers, and no bound as ``null``.
+    Settings newer than the run are not compared, nor those that the job leaves to the task: older runs hold these as
+    numbers, or as ``null`` for no bound.
     """
     return all(job.settings.get(key) == value or _is_left_to_the_task(job, key, value) for key, value in run.items())
 

@@ -29,7 +29,7 @@ from omegaconf import DictConfig
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 POLL_SECONDS = 1.0
 PATIENCE_SECONDS = 120.0
-"""How long a job of a sweep waits for a process in its folder: one of a killed sweep has yet to save itself."""
+"""How long a job waits for another process in its folder: one of a killed sweep may still be saving itself."""
 STARTED, DONE = "started", "done"
 Note = dict[str, Any]
 
@@ -90,7 +90,7 @@ class Sweep(Callback):
     def _note(self, config: DictConfig, state: str) -> None:
         assert self.ledger is not None
         if _stop.orphaned:
-            return  # the same command may have been given again: the book is that sweep's now
+            return  # the same command may have been started again: the ledger now belongs to that sweep
         note = {
             "job": config.hydra.job.num,
             "folder": os.path.relpath(config.hydra.runtime.output_dir, config.hydra.runtime.cwd),
@@ -168,7 +168,7 @@ class _Stop:
             threading.Thread(target=self._watch_parent, args=(os.getppid(),), daemon=True).start()
 
     def _watch_parent(self, parent: int) -> None:
-        """Ends this worker when the sweep's main process is no more (kill -9), after its job has saved itself."""
+        """Ends this worker when the sweep's main process has been killed (kill -9), after its job has saved itself."""
         while os.getppid() == parent:
             time.sleep(POLL_SECONDS)
         self.orphaned = True
@@ -178,7 +178,7 @@ class _Stop:
         os._exit(128 + signal.SIGTERM)
 
     def _leave_job(self, number: int, _: FrameType | None) -> None:
-        """An idle worker only remembers: if one dies, joblib kills all others."""
+        """An idle worker only takes note: if one dies, joblib kills all others."""
         from hdrqn_torchrl.runs.interruption import Interrupted
 
         self.number = number

@@ -82,7 +82,7 @@ def train(run: Plan) -> float:
 
 @contextlib.contextmanager
 def in_words(run: Plan) -> Iterator[None]:
-    """Turns what a user can get wrong, and what a machine can do wrong, into messages without a traceback."""
+    """Turns errors of the user and of the machine into messages without a traceback."""
     from torchrl.checkpoint import CheckpointError
 
     from hdrqn_torchrl.learning.finite import NonFiniteError
@@ -103,7 +103,7 @@ def in_words(run: Plan) -> Iterator[None]:
 
 
 def tell(sentence: str) -> None:
-    """Says on the terminal what takes long."""
+    """Announces slow work on the terminal."""
     print(sentence, file=sys.stderr, flush=True)
 
 
@@ -205,7 +205,7 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     evaluation_base = build_env(config, played, allowed)
     if found := interface_differences(env, evaluation_base):
         raise ValueError(
-            f"evaluation.env must leave what the agent sees and does as it is in training, got "
+            f"evaluation.env must not change what the agent sees or does, got "
             f"{config.evaluation.env}: {found}; set env.KEY for both."
         )
     evaluation_env = algorithm.transform(evaluation_base)

@@ -10,7 +10,7 @@ seed             of worlds and exploration; the same seed shows the same episode
 checkpoint       best (default), last, or the path of a checkpoint or weights file
 epsilon          probability of a random choice, at every level (default 0: greedy)
 fps              steps a second (default 4)
-env.KEY          a setting of the task that shall differ from the run's: env.view, env.obstacle, env.max_steps, ...
+env.KEY          a setting of the task to change from the run's: env.view, env.obstacle, env.max_steps, ...
 allowed_targets  builders of your own that the run may name: [package.builder]
 """
 
@@ -67,7 +67,7 @@ def run(settings: Settings) -> None:
     if path is not None:
         write(frames, path, settings.fps)
         return
-    with suppress(KeyboardInterrupt):  # seen enough
+    with suppress(KeyboardInterrupt):  # the user has seen enough
         play_in_terminal(frames, fps=settings.fps)
 
 

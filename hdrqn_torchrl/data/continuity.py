@@ -1,4 +1,4 @@
-"""Whether collected batches are what memories take them for: the same worlds, going on from batch to batch."""
+"""Checks that collected batches are what memories assume: the same worlds, continued from batch to batch."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from hdrqn_torchrl import keys
 
 
 class Continuity:
-    """Looks at batches ``[N, T]`` as they come and refuses what would be learned from wrongly, without a word.
+    """Checks batches ``[N, T]`` as they come and refuses those that would silently be learned from wrongly.
 
     Each row must go on where it ended in the last batch, in the same episode, unless that one was over or a new one
-    begins. Rows of two collectors do not: what began in one's world would end in the other's. And where an episode
-    ends, so must its option; a time limit behind :class:`~hdrqn_torchrl.transforms.SubgoalTransform` leaves it open.
+    begins. Rows of two collectors do not: what began in a world of one would end in a world of the other. And where an
+    episode ends, so must its option; a time limit behind :class:`~hdrqn_torchrl.transforms.SubgoalTransform` leaves it
+    open.
 
     Args:
         traj_key: number of the episode.
@@ -43,7 +44,7 @@ class Continuity:
         self.reset()
 
     def reset(self) -> None:
-        """The next batch may be any."""
+        """Accepts any next batch."""
         self._episode: Tensor | None = None  # [N, 1]: that of the last step, ...
         self._over: Tensor | None = None  # [N, 1]: ... and whether it was over
 
@@ -51,7 +52,7 @@ class Continuity:
         """Looks at the next batch.
 
         Raises:
-            ValueError: if it can't be one.
+            ValueError: if it does not continue the last one.
         """
         if batch.ndim != 2:
             raise ValueError(
@@ -69,7 +70,7 @@ class Continuity:
         episodes, ends = torch.cat([before, episode], 1), torch.cat([over_before, over], 1)
         jumps = (episodes[:, 1:] != episodes[:, :-1]) & ~ends[:, :-1]
         starts = batch.get(self.init_key, None)
-        if starts is not None:  # an episode that is over goes on no more
+        if starts is not None:  # an episode that is over does not go on
             jumps = (jumps | ends[:, :-1]) & ~starts.squeeze(-1)
         option_done = batch.get("next").get(self.option_done_key, None)
         left_open = torch.zeros_like(over) if option_done is None else over & ~option_done.squeeze(-1)

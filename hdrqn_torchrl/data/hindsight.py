@@ -2,7 +2,7 @@
 
 Off-policy Q-learning may learn about any subgoal from any step (Kaelbling, 1993; HER, Andrychowicz et al., 2017). At
 the sub level :func:`relabel_subgoals` shows each replayed sequence once for every subgoal; at the meta level
-:class:`HindsightOptions` tells each episode once more as if every option had been chosen for what it attained.
+:class:`HindsightOptions` replays each episode once more as if every option had been chosen for what it attained.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ def relabel_subgoals(
 ) -> TensorDictBase:
     """Shows each sequence as it was, then as if the sub-controller had been sent to each other subgoal instead.
 
-    Told for another subgoal g than the one pursued at its first step, a sequence differs as acting would have:
+    Relabelled for a subgoal g other than the one pursued at its first step, a sequence differs as acting would have:
 
     - g is in force throughout, and reward and termination of each step are those of g;
-    - the option ends where g is reached. That the subgoal really pursued was reached, or could not be any more, is no
-      end for g, so there the recurrent state goes on; to cut the sequence there would leave out steps *because* of
-      what they attained, which biases values. Every other end (episode, time limit) is one for g, too;
+    - the option ends where g is reached. Reaching the subgoal really pursued, or losing it, does not end an
+      option for g, so there the recurrent state goes on; to cut the sequence there would leave out steps *because* of
+      what they attained, which biases values. Every other end (episode, time limit) ends one for g, too;
     - where g could not be chosen any more, since it had been attained before, a step is not eligible for the loss.
       The next eligible one starts an episode, so these steps reach no target and no state that is trained.
 
@@ -50,8 +50,8 @@ def relabel_subgoals(
         sample: sequences ``[B, T]`` of the sub level with ``attained``, ``hazard`` and ``subgoal_mask``.
         num_subgoals: G.
         rewards: what the option book paid by.
-        state_keys: recurrent states stored with the steps, if any. They come from the subgoal that was pursued; told
-            for another one, a sequence starts from zero.
+        state_keys: recurrent states stored with the steps, if any. They come from the subgoal that was pursued;
+            relabelled for another one, a sequence starts from zero.
         subgoal_key: subgoal in force.
         attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``;
             ``hazard_key=None``: no hazard.
@@ -91,22 +91,22 @@ def relabel_subgoals(
 
 
 class HindsightOptions:
-    r"""The options ``[M]`` of finished episodes, and the same episodes told by what each option attained.
+    r"""The options ``[M]`` of finished episodes, and the same episodes relabelled by what each option attained.
 
     An option that pursued g from :math:`s_0` to :math:`s_k` and attained g' on its way, at :math:`s_j`, becomes two:
     g' from :math:`s_0` to :math:`s_j`, and g from there on. Each has its own return and steps, and the second starts
     from what the meta-controller would have read at :math:`s_j`: the observation (v1) or the sub-controller's state as
-    it was (v2; with ``OptionHistory`` it can be computed anew as if the sub-controller had been told so). Episodes in
-    which every option attained its own subgoal or none are not told again. The others follow as trajectories of their
-    own, numbered :math:`-1 - n` for the episode :math:`n`, so that no sequence mixes the two.
+    it was (v2; with ``OptionHistory`` it can be computed again as if the sub-controller had pursued g'). Episodes in
+    which every option attained its own subgoal or none are not repeated. The others follow as separate trajectories,
+    numbered :math:`-1 - n` for the episode :math:`n`, so that no sequence mixes the two.
 
-    Told options have always attained something: what is learned of a choice leans towards its success.
+    Relabelled options have always attained something: the values of choices are biased towards success.
 
     Args:
         pursued: extracts the options as they were.
         retold: the same settings, but with an ``active_subgoal_key`` (and a history, if any) of its own.
         gamma: discount inside an option, as in :class:`~hdrqn_torchrl.transforms.SubgoalTransform`.
-        at_start: changes the root entries ``[S]`` of the steps at which only the told options start; for inputs that
+        at_start: changes the root entries ``[S]`` of the steps at which only relabelled options start; for inputs that
             are not at the root of such a step.
         attained_key, extrinsic_reward_key: under ``"next"``.
         mask_key: subgoals not yet attained. Of several that a step attains the first counts.
@@ -141,9 +141,9 @@ class HindsightOptions:
         self._forget()
 
     def _forget(self) -> None:
-        self._book: tuple[Tensor, Tensor] | None = None  # [N, 1] each: steps and return of the told option in progress
-        self._split: Tensor | None = None  # [N, 1]: whether the last step ended a told option only
-        self._changed: Tensor | None = None  # numbers of the episodes in progress that are told differently
+        self._book: tuple[Tensor, Tensor] | None = None  # [N, 1] each: steps, return of the relabelled option
+        self._split: Tensor | None = None  # [N, 1]: whether the last step ended a relabelled option only
+        self._changed: Tensor | None = None  # numbers of the episodes in progress that are relabelled
 
     def reset(self) -> None:
         """Forgets options and episodes in progress (the collector started new episodes)."""
@@ -160,7 +160,7 @@ class HindsightOptions:
         return torch.cat(found) if found else None
 
     def _retell(self, batch: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """The batch as if options had been chosen for what they attained; steps ``[N, T]`` where that is news."""
+        """The batch as if options had been chosen for what they attained; steps ``[N, T]`` where that differs."""
         names, after = self.pursued, batch.get("next").copy()
         subgoal, attained = after.get(names.active_subgoal_key), after.get(self.attained_key)
         news = attained & batch.get(self.mask_key)  # [N, T, G]
@@ -178,7 +178,7 @@ class HindsightOptions:
         return self._read_at_starts(told, (init & ~own_init).squeeze(-1)), relabelled
 
     def _keep_book(self, init: Tensor, reward: Tensor) -> tuple[Tensor, Tensor]:
-        """Steps and returns of the told options, ``[N, T, 1]`` each."""
+        """Steps and returns of the relabelled options, ``[N, T, 1]`` each."""
         book = (torch.zeros_like(init[:, 0], dtype=torch.int64), torch.zeros_like(reward[:, 0]))
         book, pages = self._book or book, []
         for time in range(init.shape[1]):
@@ -189,7 +189,7 @@ class HindsightOptions:
         return torch.stack(steps, 1), torch.stack(collected, 1)
 
     def _read_at_starts(self, told: TensorDictBase, starts: Tensor) -> TensorDictBase:
-        """Puts what the meta-controller would have read where only told options start, ``starts`` ``[N, T]``."""
+        """Puts what the meta-controller would have read where only relabelled options start, ``starts`` ``[N, T]``."""
         if self.at_start is None or not starts.any():
             return told
         rows = self.at_start(told.exclude("next")[starts])
@@ -200,7 +200,7 @@ class HindsightOptions:
     def _keep_changed(
         self, options: TensorDictBase | None, episode: Tensor, relabelled: Tensor
     ) -> TensorDictBase | None:
-        """Those options whose episodes are told differently, under their own numbers."""
+        """The options of relabelled episodes, under numbers of their own."""
         changed = episode[relabelled]
         if self._changed is not None:
             changed = torch.cat([self._changed, changed])

@@ -1,4 +1,4 @@
-"""Observations of whole options, from which v2's stored states can be computed anew (refreshed)."""
+"""Observations of whole options, from which v2's stored states can be recomputed (refreshed)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class OptionHistory:
 
         Returns:
             For each end, by environment and then by time, the option's observations and the one that it ended in,
-            ``[M, L + 1, ...]``; what lies behind is undefined.
+            ``[M, L + 1, ...]``; what follows is undefined.
         """
         observation = batch.get(self.observation_key)
         following = batch.get(unravel_key(("next", self.observation_key)))
@@ -72,7 +72,7 @@ class OptionHistory:
 def refresh_hidden(
     sub_controller: SubController, max_steps: int, sample: TensorDictBase, *, read_last_observation: bool = False
 ) -> TensorDictBase:
-    """Computes the sub-controller's states in option transitions anew, with its present weights.
+    """Recomputes the sub-controller's states in option transitions with its present weights.
 
     Args:
         sub_controller: whose states they are.

@@ -22,8 +22,8 @@ class OptionExtractor:
     terminated, with nothing chosen. It can't be trained; samplers never begin with it.
 
     Rows come out by whole episodes, each in order and without gaps, once the episode is over; so a replay buffer can
-    hold them one after the other. Of an episode that is very long or has no end, a piece comes out now and then. A
-    piece, too, ends with a final row: a copy of the row that the next piece begins with. So each option is learned
+    hold them one after the other. Of an episode that is very long or has no end, a piece comes out from time to time. A
+    piece also ends with a final row: a copy of the row that the next piece begins with. So each option is learned
     from, but sequences do not go from one piece to the next. Batches must come from one collector, in order, with the
     same N environments.
 
@@ -45,7 +45,7 @@ class OptionExtractor:
         state_keys: more entries of the step at which the option started, the controller's recurrent state for
             instance; final rows have none.
         history: keeps the observations of the option before in each row, so that
-            :func:`~hdrqn_torchrl.data.refresh_hidden` can compute v2's inputs anew.
+            :func:`~hdrqn_torchrl.data.refresh_hidden` can recompute v2's inputs.
         max_held: finished options of an unfinished episode that are held back, for each environment; if there are more,
             they come out.
 
@@ -147,7 +147,7 @@ class OptionExtractor:
     ) -> TensorDictBase:
         """Rows of the options that ended, and final rows where episodes were truncated."""
         environment, end_time = ended.nonzero(as_tuple=True)
-        options = starts[started.nonzero(as_tuple=True)]  # and not by mask: a GPU would count anew for every entry
+        options = starts[started.nonzero(as_tuple=True)]  # and not by mask: a GPU would count again for every entry
         after = batch.get("next")[environment, end_time]
         options.set(self.subgoal_key, after.get(self.active_subgoal_key))
         ends = after.select(self.option_steps_key, self.option_return_key, self.done_key, self.terminated_key)

@@ -135,14 +135,14 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         return index[:, 0].cpu() if storage.ndim == 1 else (index[:, 0] * storage.shape[1] + index[:, 1]).cpu()
 
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
-        """Forgets the priorities of steps that were written over."""
+        """Forgets the priorities of steps that were overwritten."""
         assert isinstance(index, Tensor) and storage is not None
         place = self._places(index.view(-1, storage.ndim), storage)
         self._starts[place] = False
         self._sum_tree[place] = 0.0
 
     def update_priority(self, index: int | Tensor, priority: float | Tensor, *, storage: Storage | None = None) -> None:
-        """Sets priorities of starts that were drawn; those that were written over since then are passed over.
+        """Sets priorities of starts that were drawn; those that were overwritten since then are skipped.
 
         Args:
             index: their places in the storage, ``[M, ndim]``.
@@ -173,7 +173,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         """Restores what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if it is of another capacity, or holds what is no priority.
+            ValueError: if it is of another capacity, or holds something other than priorities.
         """
         priorities, starts = (state_dict[name].cpu() for name in ("priorities", "starts"))  # where the trees are
         self._check_state(priorities, starts, state_dict["largest"])

@@ -1,4 +1,4 @@
-"""Replay memories that give back sequences (section III-B of the paper)."""
+"""Replay memories that return sequences (section III-B of the paper)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from hdrqn_torchrl.data.storage import SequenceStorage
 
 Sampling = Literal["steps", "episodes", "episode_starts", "whole_episodes"]
 FROM_STARTS = ("episode_starts", "whole_episodes")
-"""Samplings whose sequences all begin where an episode does, so that the zero state is exact."""
+"""Kinds of sampling whose sequences all begin where an episode does, so that the zero state is exact."""
 AnySampler = StepSliceSampler | EpisodeStartSampler | PrioritizedSequenceSampler
 
 
@@ -29,7 +29,7 @@ class SequenceBuffer(TensorDictReplayBuffer):
     """TorchRL's replay buffer for batches of any length: a single step, or more than it can hold."""
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Stores transitions ``[N, T]`` or ``[M]``; of too many, the newest.
+        """Stores transitions ``[N, T]`` or ``[M]``; the newest, if they are too many.
 
         Args:
             tensordicts: what is stored.
@@ -53,7 +53,7 @@ class SequenceBuffer(TensorDictReplayBuffer):
         """Restores what ``state_dict`` returned.
 
         Raises:
-            ValueError: if it is of a memory of another size, or can't be what a memory returned.
+            ValueError: if it belongs to a memory of another size, or to none.
         """
         cursor = state_dict["_writer"]["_cursor"]
         if not 0 <= cursor < self._storage.rows:

@@ -102,7 +102,7 @@ class EpisodeSliceSampler(StepSliceSampler):
 
     Args:
         slice_len: steps of a slice.
-        lookahead: how many of them, at its end, have no say in where it begins; they are padding where the episode is
+        lookahead: how many of them, at its end, do not influence where it begins; they are padding where the episode is
             over. So an episode's last steps are shown before these as well.
         traj_key, terminated_key: as in :class:`StepSliceSampler`.
     """
@@ -157,7 +157,7 @@ class WholeEpisodeSampler(StepSliceSampler):
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
         length, count = self._adjusted_batch_size(batch_size)
         first, lengths, _ = self._episodes(storage)
-        if not len(first):  # the ring wrote over the beginning of every episode
+        if not len(first):  # the ring has overwritten the beginning of every episode
             raise RuntimeError("no stored episode has its first step; raise capacity above the length of an episode.")
         chosen = torch.randint(len(first), (count,), device=first.device, generator=self._rng)
         return padded_slices(first[chosen], lengths[chosen], length, rows=storage.shape[0])

@@ -1,4 +1,4 @@
-"""Where a replay memory keeps its transitions: a ring of rows, with a state from which it goes on as it was."""
+"""Where a replay memory keeps its transitions: a ring of rows, with a state from which it continues unchanged."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class SequenceStorage(LazyTensorStorage):
         stored = state_dict["stored"]
         if stored is not None:
             self._check_state(stored, state_dict["rows"], state_dict["last_cursor"])
-        self._bump_mutation_revision()  # what samplers remember of the old contents is void
+        self._bump_mutation_revision()  # samplers must forget the old contents
         self.initialized = stored is not None
         if stored is None:
             self._storage, self._len = None, 0

@@ -1,4 +1,4 @@
-"""Checks whether an environment keeps the contract of tasks, by stepping it; says what each fault or gap costs."""
+"""Checks whether an environment fulfils the contract for tasks, by stepping it; says what each fault or gap costs."""
 
 from __future__ import annotations
 
@@ -25,18 +25,17 @@ _GO_ON = 20  # steps after a restored state
 
 
 def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding]:
-    """Steps an environment with random actions, from two seeds, and compares it with the contract of tasks.
+    """Steps an environment with random actions, from two seeds, and compares it with the contract for tasks.
 
-    What chance does not meet is not checked: an episode that random actions never end, a subgoal that they never
-    attain.
+    What random actions do not reach is not checked: the end of an episode, say, or a subgoal.
 
     Args:
-        env: with batch size ``[N]``, without an agent's own transforms; it is reset, its worlds are lost.
+        env: with batch size ``[N]``, without an agent's own transforms; it is reset, so its worlds are lost.
         steps: of each rollout.
         seed: the first one.
 
     Returns:
-        What is wrong first, then what is missing; empty if there is nothing to say.
+        What is wrong first, then what is missing; empty if nothing is.
 
     Raises:
         ValueError: if ``steps`` is below 1.
@@ -65,7 +64,7 @@ def _sets(env: EnvBase, task: Task) -> tuple[SubgoalSet, ...]:
 
 
 def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
-    """What the specs say."""
+    """Faults of the specs."""
     if len(env.batch_size) != 1:
         yield wrong(f"the batch size must be [N], got {list(env.batch_size)}", "no agent can be made for it")
         return
@@ -103,13 +102,13 @@ def _optional(specs: dict, task: Task) -> Iterator[Finding]:
     elif keys.EXTRINSIC_REWARD not in specs:
         yield missing("'extrinsic_reward' is missing", "agents of one level only")
     if keys.HAZARD not in specs:
-        yield missing("'hazard' is missing", "no penalty for what is to be avoided")
+        yield missing("'hazard' is missing", "no penalty for hazards")
     if task.success not in specs:
         yield missing(f"{task.success!r} is missing", "no success rate")
 
 
 def _statement(env: EnvBase, task: Task) -> Iterator[Finding]:
-    """What the task says wrongly or leaves unsaid."""
+    """What the task states wrongly or leaves unstated."""
     if (stated := _other_statement(env)) is not None:
         yield wrong(f"'task' must be a Task, got {stated!r}", "what it states is not read")
     action = env.full_action_spec.get(keys.ACTION, None)
@@ -139,7 +138,7 @@ def _other_statement(env: EnvBase) -> object:
 
 
 def _behaviour(env: EnvBase, task: Task, steps: int, seed: int) -> list[Finding]:
-    """What shows when it is stepped."""
+    """Faults that show when it is stepped."""
     first, again, other = (_rollout(env, steps, each, seed) for each in (seed, seed, seed + 1))
     found = list(_shapes(env, first[0]))
     if found:
@@ -167,7 +166,7 @@ def _go_on(env: EnvBase, tensordict: TensorDictBase, steps: int) -> Rollout:
 
 
 def _shapes(env: EnvBase, step: TensorDictBase) -> Iterator[Finding]:
-    """Whether what is written is what the specs promise."""
+    """Whether the entries are as the specs promise."""
     specs = {**dict(env.observation_spec.items(True, True)), **dict(env.full_reward_spec.items(True, True))}
     specs |= dict(env.full_done_spec.items(True, True))
     for key, spec in specs.items():
@@ -276,7 +275,7 @@ def _round_trip(env: EnvBase) -> Iterator[Finding]:
     tensordict = env.step_and_maybe_reset(env.rand_action(env.reset()))[1]
     state = deepcopy(base.state_dict())
     if not state:
-        yield missing("state_dict() returns nothing", "no resume: a training that was stopped begins anew")
+        yield missing("state_dict() returns nothing", "no resume: a training that was stopped starts from scratch")
         return
     rollouts = []
     for _ in range(2):
@@ -284,4 +283,6 @@ def _round_trip(env: EnvBase) -> Iterator[Finding]:
         with own_random_numbers(0):
             rollouts.append(_go_on(env, tensordict.clone(), _GO_ON))
     if not _same(*rollouts):
-        yield wrong("state_dict() must hold all there is, random numbers too, and does not", "resumed trainings differ")
+        yield wrong(
+            "state_dict() must hold the whole state with random numbers, and does not", "resumed trainings differ"
+        )

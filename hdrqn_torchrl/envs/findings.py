@@ -1,4 +1,4 @@
-"""What the check of an environment has to say."""
+"""Findings of the check of an environment."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that an environment does wrong or does without.
+    """Something that an environment does wrong or lacks.
 
     Attributes:
-        what: the fault or the gap, in a sentence.
+        what: the fault or the gap.
         severity: ``"wrong"``: against the contract; ``"missing"``: agents can do without it.
         costs: what that costs.
     """
@@ -25,7 +25,7 @@ class Finding:
 
 
 def wrong(what: str, costs: str) -> Finding:
-    """Something against the contract of tasks."""
+    """Something against the contract for tasks."""
     return Finding(what, "wrong", costs)
 
 

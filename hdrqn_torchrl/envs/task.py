@@ -1,4 +1,4 @@
-"""What a task tells about itself, so that nothing has to be guessed from names of settings or sizes of rewards."""
+"""What a task states about itself, so that nothing has to be guessed from names of settings or sizes of rewards."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class SceneFactory(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """A scripted player that marks what can be achieved on a task. It plays only when somebody asks.
+    """A scripted player that marks what can be achieved on a task. It plays only when asked to.
 
     Figures are means over episodes: ``return_mean`` and, as far as there are any, ``success_rate``, ``steps_mean`` and
     ``episodes``.
@@ -72,8 +72,8 @@ class Task:
         largest_return: largest return there can be of ``reward``.
         largest_extrinsic_return: largest return there can be of ``extrinsic_reward``.
         smallest_extrinsic_return: smallest one; 0 where that reward is never negative.
-        subgoals: sets of subgoals, from near to far; an agent of L levels pursues the last L - 1 of them. None: it is
-            known only that there is one set, of as many as ``attained`` has.
+        subgoals: sets of subgoals, from near to far; an agent of L levels pursues the last L - 1 of them. If empty,
+            there is one set, whose size is that of ``attained``.
         ordered: whether the farthest subgoals are to be attained one after the other, as they are numbered. Then the
             share of them that were is counted, as ``in_order``.
         success: entry that tells whether a step completed the whole task, if the environment writes it.
@@ -171,7 +171,7 @@ def task_of(env: EnvBase) -> Task:
     changes rewards nothing is known of their sums.
 
     Args:
-        env: any environment. Of a batch of environments, the first one is built anew and asked.
+        env: any environment. Of a batch of environments, a new copy of the first one is asked.
 
     Examples:
         >>> from torchrl.envs import StepCounter, TransformedEnv
@@ -194,7 +194,7 @@ def task_of(env: EnvBase) -> Task:
 
 
 def _through(transform: Module, task: Task) -> Task:
-    """What is left of a statement behind a transform: one that changes rewards makes what was said of them void."""
+    """What is left of a statement behind a transform: one that changes rewards voids what was stated about them."""
     if isinstance(transform, StepCounter):
         task = task.within(transform.max_steps)
     if isinstance(transform, Critic):
@@ -218,7 +218,7 @@ def _with_subgoals(task: Task, critic: Critic) -> Task:
 
 def _task_of_worker(env: BatchedEnvBase) -> Task:
     """Asked of a new one: a worker process that lacks an attribute ends when it is asked for it."""
-    with own_random_numbers():  # to look changes nothing
+    with own_random_numbers():  # reading it changes nothing
         worker = env.create_env_fn[0](**env.create_env_kwargs[0])
     try:
         return task_of(worker)

@@ -1,4 +1,4 @@
-"""Learning: one learner for each level, its settings, and what watches over it."""
+"""Learning: one learner for each level, its settings, and its monitors."""
 
 from hdrqn_torchrl.learning.learner import Learner
 from hdrqn_torchrl.learning.memory import Extract

@@ -19,8 +19,8 @@ class FiniteGuard:
     """Looks at the loss and the gradients of every update before the optimiser does.
 
     On a CPU it looks at once. On a GPU the host would have to wait for every update; there the optimiser itself skips
-    the step and all that follow (``found_inf`` of fused Adam, which never leaves the device), what happened first is
-    kept on the device, and :meth:`check` looks at it when asked.
+    the step and all that follow (``found_inf`` of fused Adam, which never leaves the device), the first fault is kept
+    on the device, and :meth:`check` reports it when called.
 
     Args:
         at_once: whether to look at every update.

@@ -37,7 +37,7 @@ class Learner:
         episode_len: largest number of transitions of an episode, if known (see
             :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         refresh: applied to every minibatch before it is learned from.
-        separate: parts of the network, by how the names of their parameters begin, that are optimised apart: with
+        separate: parts of the network, by prefixes of their parameters' names, that are optimised separately: with
             this share of the learning rate, and with gradients clipped by their own norm.
         samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
             and one large draw costs little more than a small one. Priorities are those of
@@ -84,7 +84,7 @@ class Learner:
         self._continuity = Continuity()
         self._drawn: list[TensorDictBase] = []
         self.held = False
-        """Whether it stores only; what it could have learned meanwhile is not made up for."""
+        """Whether it only stores; updates missed meanwhile are not made up for."""
         self._warm_at = settings.warmup_frames  # or when a sequence could be drawn, if that was later
         self._has_warned = False
 
@@ -104,7 +104,7 @@ class Learner:
             NonFiniteError: as :meth:`check_finite`.
         """
         self.check_finite()
-        if batch.device != self.device:  # a collector that was told no device numbers its episodes on the host
+        if batch.device != self.device:  # a collector without a device of its own numbers its episodes on the host
             batch = batch.to(self.device)
         self._continuity.check(batch)
         self.frames += batch.numel()
@@ -124,7 +124,7 @@ class Learner:
             self._warm_at += math.ceil(self._frames_owed)
 
     def _warn_of_longer_episodes(self, transitions: TensorDictBase) -> None:
-        """Says once that an episode has transitions that no sequence from its start will ever show."""
+        """Warns once that an episode has transitions that no sequence from its start will ever show."""
         if self._longer is not None and self._longer.seen(transitions):
             self._longer = None
             warnings.warn(
@@ -239,19 +239,19 @@ class Learner:
         return rest | self.memory_state_dict() if memory else rest
 
     def memory_state_dict(self) -> dict[str, Any]:
-        """The replay memory, the minibatches drawn from it and when it is warm: large, and the rest goes without."""
+        """The replay memory, the minibatches drawn from it and when it is warm: large, and optional."""
         return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self._warm_at}
 
     def load_memory_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`memory_state_dict` returned.
 
-        A memory of earlier versions, which kept each observation twice, is left out, with a warning: it would begin
-        empty and is warmed up anew.
+        A memory of earlier versions, which kept each observation twice, is left out, with a warning: the memory
+        then begins empty and is warmed up again.
         """
         if holds_inputs_twice(state["buffer"], self.loss.in_keys):
             warnings.warn(
                 "the stored replay memory is of an earlier version, which kept each observation twice; it begins empty "
-                "and is warmed up anew, so that the training goes on, but not bit for bit as it would have.",
+                "and is warmed up again, so that the training goes on, but not bit for bit as it would have.",
                 stacklevel=3,
             )
             self._begin_empty()
@@ -260,10 +260,10 @@ class Learner:
         self._drawn, self._warm_at = list(state["drawn"]), state["warm_at"]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up anew.
+        """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up again.
 
         Raises:
-            ValueError: if it can't be what a learner of these settings returned.
+            ValueError: if it is not the state of a learner with these settings.
         """
         check_counters(state, self.settings)
         self._continuity.reset()

@@ -1,4 +1,4 @@
-"""Legs: options by where they began and where they were to lead."""
+"""Legs: options by where they began and the subgoal they pursued."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The replay memory that a learner's settings and loss ask for."""
+"""The replay memory that a learner's settings and loss require."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is counted besides the learning: one protocol, and visits of subgoals as its plainest case."""
+"""What is counted besides the learning: one protocol, and visits of subgoals as its simplest case."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Monitor(Protocol):
         """Takes in a collected batch ``[N, T]``."""
 
     def metrics(self) -> dict[str, float]:
-        """Columns of the next row; to look changes nothing."""
+        """Columns of the next row; reading them changes nothing."""
 
     def clear(self) -> None:
         """Begins the next row. It is called when the last one is written, no sooner."""

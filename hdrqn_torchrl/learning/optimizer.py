@@ -11,11 +11,11 @@ from torch.nn import Parameter
 
 
 class GroupedAdam(torch.optim.Adam):
-    """Fused Adam. Parts that are optimised apart have gradients clipped by their own norm, too.
+    """Fused Adam. Parts that are optimised separately also have gradients clipped by their own norm.
 
     Args:
         parameters: by name.
-        separate: beginnings of the names of such parts, and their shares of the learning rate.
+        separate: prefixes of the names of such parts, and their shares of the learning rate.
         learning_rate: of all the rest.
 
     Raises:
@@ -107,7 +107,7 @@ def _group(parameters: Mapping[str, Parameter], separate: Mapping[str, float]) -
     for name, (share, members) in groups.items():
         if not members or share <= 0:
             raise ValueError(
-                f"separate must map beginnings of parameters' names to shares > 0 of the learning rate, got "
+                f"separate must map prefixes of parameters' names to shares > 0 of the learning rate, got "
                 f"{name!r}: {share}, which {len(members)} parameters have; look at network.named_parameters()."
             )
     return [(1.0, rest), *groups.values()]

@@ -69,7 +69,7 @@ class Phases:
         return 1 if self.exploration.held else 2
 
     def observe(self, batch: TensorDictBase) -> None:
-        """Takes note of a collected batch ``[N, T]``, and begins the second phase when it is time."""
+        """Counts a collected batch ``[N, T]``, and begins the second phase when it is time."""
         self.success.observe(batch)
         self.frames += batch.numel()
         if self.phase == 1:
@@ -84,7 +84,7 @@ class Phases:
         return {"phase": self.phase, **{f"phase/success_{index}": rate for index, rate in enumerate(known.tolist())}}
 
     def clear(self) -> None:
-        """Nothing begins anew with a row."""
+        """Nothing starts again with a row."""
 
     def _hold(self, held: bool) -> None:
         self.exploration.held = held
@@ -109,7 +109,7 @@ class Phases:
 def phase_monitors(
     settings: PhaseOne | None, num_subgoals: int, exploration: EpsilonGreedy, learner: Learner | None
 ) -> dict[str, Monitor]:
-    """What a training in two phases is watched by; nothing if ``settings`` is ``None``.
+    """The monitors of a training in two phases; none if ``settings`` is ``None``.
 
     Args:
         settings, num_subgoals, exploration, learner: as in :class:`Phases`.

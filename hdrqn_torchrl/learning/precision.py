@@ -1,7 +1,7 @@
 """The precision of learning: float32, or bfloat16 in the matrix products of losses.
 
-Lower is only what autocast lowers, dense layers, convolutions and the LSTM. Parameters, Q-values, targets, optimiser,
-acting and all that is stored are float32 in any case.
+Only what autocast lowers has the lower precision: dense layers, convolutions and the LSTM. Parameters, Q-values,
+targets, optimiser, acting and all that is stored are float32 in any case.
 """
 
 from __future__ import annotations

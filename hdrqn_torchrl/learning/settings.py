@@ -148,10 +148,10 @@ class LearnerSettings:
         return target_lookahead(0.0 if self.sampling in FROM_STARTS else decay, self.n_step, self.slice_len)
 
     def lasting(self, total_frames: int | None) -> LearnerSettings:
-        """The same settings for a training of so many environment frames: the learning rate falls until its end.
+        """The same settings for a training of ``total_frames``: the learning rate falls until its end.
 
         Args:
-            total_frames: of the whole training; ``None``: no change.
+            total_frames: environment frames of the whole training; ``None``: no change.
 
         Examples:
             >>> LearnerSettings().lasting(200_000).learning_rate_frames

@@ -1,4 +1,4 @@
-"""Whether the stored state of a learner can be one, looked at before anything is loaded."""
+"""Checks that a stored state can be that of a learner, before anything is loaded."""
 
 from __future__ import annotations
 

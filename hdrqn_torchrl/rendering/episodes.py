@@ -1,4 +1,4 @@
-"""Plays episodes and keeps for every step what explains it: world, view, rewards, and the Q-values of every level."""
+"""Plays episodes and records what explains every step: world, view, rewards, and the Q-values of every level."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def record_episodes(
     if not 0.0 <= epsilon <= 1.0:
         raise ValueError(f"epsilon must lie in [0, 1], got {epsilon}; 0 plays greedily.")
     if not algorithm.levels:
-        raise ValueError("algorithm must tell its levels to be watched, got none; give it levels=views_of(...).")
+        raise ValueError("algorithm must name its levels to be watched, got none; give it levels=views_of(...).")
     exploration_type = ExplorationType.RANDOM if epsilon > 0 else ExplorationType.DETERMINISTIC
     with (
         isolated(env, algorithm.policy, seed=seed, exploration_type=exploration_type),
@@ -196,7 +196,7 @@ def _happened(after: TensorDictBase, key: NestedKey) -> bool:
 
 @contextmanager
 def _fixed_epsilon(explorations: dict[str, EpsilonGreedy], epsilon: float) -> Iterator[None]:
-    """Sets the epsilon of every level, and sets it back."""
+    """Sets the epsilon of every level, and restores it."""
     kept = {name: exploration.fixed for name, exploration in explorations.items()}
     try:
         for exploration in explorations.values():

@@ -1,4 +1,4 @@
-"""What is kept of every moment of a recorded episode."""
+"""The record of one moment of an episode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Decision:
 
     @property
     def explores(self) -> bool:
-        """Whether chance chose something else than the best."""
+        """Whether chance chose something other than the best."""
         return self.choice != self.best
 
 
@@ -35,7 +35,7 @@ class Pursuit:
         level: name of the level that chose it.
         names: of the subgoals among which it was chosen.
         decision: Q-values and choice, from when the option began.
-        steps: how many steps the option has lasted.
+        steps: number of steps that the option has lasted.
     """
 
     level: str
@@ -82,10 +82,10 @@ class Frame:
         episode: counts from 1.
         episodes: how many are recorded.
         max_steps: step limit of an episode, if there is one.
-        score: what came in before this decision.
+        score: rewards and counts before this decision.
         action: Q-values of actions, and the action.
         pursuits: subgoals in force, from near to far; none for flat agents.
-        event: what the step before did; empty if nothing worth telling.
+        event: what the step before did; empty if nothing of note.
         outcome: how the episode ended; empty while it is played.
         success: whether it ended with the whole task completed.
     """
@@ -108,5 +108,5 @@ class Frame:
 
     @property
     def starts_option(self) -> bool:
-        """Whether a subgoal was chosen in this very moment."""
+        """Whether a subgoal was chosen at this moment."""
         return any(pursuit.steps == 0 for pursuit in self.pursuits)

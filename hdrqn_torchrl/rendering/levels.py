@@ -1,4 +1,4 @@
-"""What both pictures and terminal text say about a frame: names, scales and lengths of bars, the caption."""
+"""What both pictures and terminal text show of a frame: names, scales and lengths of bars, the caption."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ACTION_COLOUR = (32, 32, 32)
 
 
 class BarSpans(NamedTuple):
-    """What the full length of a bar stands for, by level: bars show how far a Q-value lies below the best one.
+    """The difference that a full bar stands for, by level: bars show how far a Q-value lies below the best one.
 
     Q-values of actions differ by a hundredth (one step of discount) around a common level, so that bars from zero
     would all look the same.
@@ -62,10 +62,10 @@ class Level:
     span: float
     note: str = ""
     brief: bool = False
-    """Whether one line tells all: the choice, without bars."""
+    """Whether it takes one line only: the choice, without bars."""
 
     def bar(self, index: int) -> float:
-        """Length of a bar in [0, 1]: 1 for the best, 0 for what is worse by ``span`` or more, or excluded."""
+        """Length of a bar in [0, 1]: 1 for the best, 0 for a choice that is worse by ``span`` or more, or excluded."""
         if not self.decision.allowed[index]:
             return 0.0
         below = self.decision.values[self.decision.best] - self.decision.values[index]

@@ -1,4 +1,4 @@
-"""The scene of any environment: the one that its task names or, failing that, what can be seen of it from outside."""
+"""The scene of any environment: the one that its task names or, failing that, what it shows to the outside."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PlainScene:
     Args:
         action_names: name of each action.
         subgoal_names: name of each subgoal.
-        rendered: a picture ``[height, width, 3]`` uint8, a text, or nothing.
+        rendered: a picture ``[height, width, 3]`` uint8, a string, or nothing.
         observation: what the agent sees.
     """
 
@@ -94,7 +94,7 @@ class PlainScene:
         return "success" if success else "over" if terminated else "time is up"
 
     def draw_world(self, size: int) -> Image.Image:
-        """What the environment renders; its text, or what the agent sees, failing that."""
+        """What the environment renders or, failing that, what the agent sees."""
         if isinstance(self.rendered, np.ndarray):
             return _fitted(Image.fromarray(self.rendered), size)
         return _written(self.write_world().plain, size)
@@ -117,7 +117,7 @@ class PlainScene:
 
 
 def _rendered(env: EnvBase) -> NDArray[np.uint8] | str | None:
-    """What ``render`` returns, if it is a picture or a text."""
+    """What ``render`` returns, if it is a picture or a string."""
     if isinstance(env, BatchedEnvBase):  # a worker process that lacks an attribute ends when it is asked for it
         return None
     render: Callable | None = getattr(env, "render", None)
@@ -148,7 +148,7 @@ def _fitted(image: Image.Image, size: int) -> Image.Image:
 
 
 def _written(text: str, size: int) -> Image.Image:
-    """A text on paper, as large as it fits."""
+    """Text on a plain background, as large as it fits."""
     image, letters = Image.new("RGB", (size, size), _PAPER), 16
     draw = ImageDraw.Draw(image)
     while letters > 6 and draw.multiline_textbbox((0, 0), text, font(letters))[2] > size - 8:

@@ -24,7 +24,7 @@ class Agent:
     """A trained agent on its task."""
 
     config: RunSettings
-    """Of its run, with the changes that were asked for."""
+    """Those of its run, with the changes that were asked for."""
     env: EnvBase
     """Transformed environment with batch size ``[num_envs]``."""
     algorithm: Algorithm
@@ -64,7 +64,7 @@ def load_agent(
     changes = {**own.evaluation.env, **(env_changes or {})}
     for key in changes:
         if key.startswith("_") or key not in own.env:
-            raise SettingsError(f"env.{key} must be one of {sorted(set(own.env) - {'_target_'})}; it is none.")
+            raise SettingsError(f"env.KEY must be one of {sorted(set(own.env) - {'_target_'})}, got {key}.")
     config = replace(own, env=own.env | changes)
     env, algorithm = build_algorithm(config, {"num_envs": num_envs, "device": "cpu"}, allowed_targets)
     try:
@@ -81,6 +81,6 @@ def refuse_other_interface(env: EnvBase, changed: EnvBase, changes: Mapping[str,
     if found := interface_differences(env, changed):
         given = " ".join(f"env.{key}={shown(value)}" for key, value in changes.items())
         raise SettingsError(
-            f"{given} must leave what the agent sees and does as its networks were made for, but {found}; train an "
+            f"{given} must not change what the agent's networks see or choose from, but {found}; train an "
             "agent for that task."
         )

@@ -1,6 +1,6 @@
 """Types of settings: what a builder's annotations ask for, checked before it is called.
 
-So every builder and settings class, one's own included, refuses ``algo.sub.batch_size=1.5`` in the same words.
+So every builder and settings class, a user's own included, refuses ``algo.sub.batch_size=1.5`` in the same words.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from hdrqn_torchrl.runs.commands import command_of
 TARGET = "_target_"
 Settings = dict[str, Any]
 _IN_WORDS: dict[Any, str] = {
-    type(None): "null", bool: "true or false", int: "an integer", float: "a finite number", str: "a text",
+    type(None): "null", bool: "true or false", int: "an integer", float: "a finite number", str: "a string",
 }  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
 
 
 def remedy() -> str:
-    """What helps against a wrong setting, for messages."""
+    """The remedy for a wrong setting, for messages."""
     return f"`{command_of('train')} --cfg job` shows every setting and its default"
 
 
@@ -73,7 +73,7 @@ def annotations_of(builder: Callable) -> dict[str, Any]:
 
 
 def fits(value: Any, hint: Any) -> bool:
-    """Whether a plain value (a number, a text, a list, ...) is what an annotation allows.
+    """Whether a plain value (a number, a string, a list, ...) is what an annotation allows.
 
     Examples:
         >>> fits(3, float), fits(3.0, int), fits(True, int), fits([1, 2], Sequence[int]), fits(None, int | None)
@@ -128,7 +128,7 @@ def in_words(hint: Any) -> str:
 
 
 def _plural(hint: Any) -> str:
-    return {int: "integers", float: "finite numbers", str: "texts"}.get(hint, in_words(hint))
+    return {int: "integers", float: "finite numbers", str: "strings"}.get(hint, in_words(hint))
 
 
 def shown(value: Any) -> str:

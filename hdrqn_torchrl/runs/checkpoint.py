@@ -36,7 +36,7 @@ class RandomState(GlobalRNGState):
         """Restores what ``state_dict`` returned.
 
         Raises:
-            ValueError: if it can't be what it returned: numpy reads beyond its table then.
+            ValueError: if it is not a valid state: numpy would read beyond its table.
         """
         name, table, place, *_ = state_dict["numpy"]
         if name != "MT19937" or table.shape != (624,) or not 0 <= place <= 624:
@@ -163,7 +163,7 @@ class Checkpoints:
     def newest(self) -> Path | None:
         """The newest checkpoint that is whole, ``None`` if there are none at all.
 
-        A warning tells of damaged ones that were passed over.
+        A warning names the damaged ones that were skipped.
 
         Raises:
             CheckpointError: if there are some and all are damaged.
@@ -203,7 +203,7 @@ class Checkpoints:
             try:
                 verify(path)
             except CheckpointError as error:
-                warnings.warn(f"{error} It is passed over.", stacklevel=3)
+                warnings.warn(f"{error} It is skipped.", stacklevel=3)
             else:
                 yield path
 
@@ -219,7 +219,7 @@ class Checkpoints:
 
 
 def _in_a_line(error: Exception) -> str:
-    """What was wrong first; torch lists every tensor, and shows whole memories."""
+    """The first complaint of an error: torch lists every tensor, and prints whole memories."""
     text = " ".join(str(error).split())
     return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
 

@@ -56,7 +56,7 @@ class ResumableCollector(Collector):
         """Restores what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if the step that was about to be taken is of other entries than this environment's.
+            ValueError: if the step that was about to be taken has other entries than this environment.
         """
         super().load_state_dict(state_dict, strict=False)
         self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL numbered the episodes anew

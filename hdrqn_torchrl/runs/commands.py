@@ -1,4 +1,4 @@
-"""The programs in words that their user can type: ``hdrqn train`` or, in a checkout, ``python train.py``."""
+"""The programs as their user types them: ``hdrqn train`` or, in a checkout, ``python train.py``."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TOP = Path(hdrqn_torchrl.__file__).parent.parent
 
 
 def command_of(program: str) -> str:
-    """How a program is started, in the way in which the one that runs was.
+    """The command that starts a program, in the form in which the running one was started.
 
     Args:
         program: one of :data:`PROGRAMS`.

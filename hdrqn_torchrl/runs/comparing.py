@@ -16,7 +16,7 @@ BOOKKEEPING = (
 )
 """May differ when a run goes on."""
 NOT_LEARNED_FROM = (*BOOKKEEPING, "logger", "device", "threads", "log_frames")
-"""Nothing that is learned depends on these: runs that differ in no other setting are the same training."""
+"""These do not affect learning: runs that differ in no other setting are the same training."""
 NOT_COMPARED = (*NOT_LEARNED_FROM, "seed", "evaluation")
 """Runs that differ in these may be averaged."""
 NOT_THE_TASK = ("num_envs", "seed", "device")

@@ -26,7 +26,7 @@ def components_of(algorithm: Algorithm) -> dict[str, Any]:
 
 
 def explained(error: CheckpointError, path: Path) -> CheckpointError:
-    """The same refusal or, where it is the reason, that phases were stored otherwise before monitors had parts."""
+    """The error itself or, where it is the reason, one that says how earlier versions stored phases."""
     try:
         earlier = "phases" in Checkpoint.manifest(path)["components"]
     except (CheckpointError, OSError, ValueError, TypeError, KeyError):

@@ -18,7 +18,7 @@ from hdrqn_torchrl.runs.state_checks import Rule
 
 CHECKSUMS, MANIFEST = "checksums.json", "manifest.json"
 MEMORY = "memory-"
-"""How the names of components begin that may be left out: replay memories, by far the largest."""
+"""Prefix of the components that may be left out: replay memories, by far the largest."""
 
 
 class DurableCheckpoint(Checkpoint):
@@ -70,7 +70,7 @@ def verify(path: Path) -> None:
 
 
 def _check_files(path: Path, sums: Mapping[str, Any]) -> None:
-    """What can be told without reading much, before much is read: places, kinds and sizes."""
+    """Cheap checks before much is read: places, kinds and sizes of the files."""
     total = 0
     for name, expected in sums.items():
         file = path / name

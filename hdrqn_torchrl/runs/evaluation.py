@@ -1,4 +1,4 @@
-"""What episodes bring: sums per episode while training, and greedy evaluation on fixed seeds."""
+"""Results of episodes: sums per episode while training, and greedy evaluation on fixed seeds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _FIGURES = {
 LONGEST_EPISODE = 10_000
 """Steps after which an episode of unknown length is taken to have no end; tasks of longer ones state their length."""
 PATIENCE = 1_000
-"""Steps after which it is said that this is being waited for."""
+"""Steps after which a message says that an evaluation waits for episodes to end."""
 
 
 class Observer(Protocol):
@@ -167,16 +167,16 @@ def play(
     observers: Sequence[Observer] = (),
     max_steps: int | None = None,
 ) -> TensorDictBase:
-    """Plays episodes, in rounds of one in each environment.
+    """Plays episodes, in rounds of one per environment.
 
-    Nothing changes in a training that goes on meanwhile (:func:`~hdrqn_torchrl.runs.isolation.isolated`).
+    A training that goes on meanwhile is not affected (:func:`~hdrqn_torchrl.runs.isolation.isolated`).
     Every environment contributes the same number of episodes: taking the first that finish would favour short
     ones. (TorchRL's ``Evaluator`` does that, hence this function.)
 
     Before each round environment and random numbers are seeded anew, from ``seed`` and the round's number. So episode i
     begins in the same world for every policy, whatever was played before, and differences between two policies can be
     taken episode by episode. Which world that is depends on ``seed`` and N. What an environment draws later in an
-    episode (sticky actions, obstacles that move) is as alike as it makes it.
+    episode (sticky actions, obstacles that move) may differ between policies.
 
     Args:
         env: environment with batch size ``[N]``, not that of a training: its episodes would be lost.

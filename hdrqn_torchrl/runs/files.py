@@ -136,7 +136,9 @@ def read_bytes(path: Path, *, root: Path | None = None, limit: int | None = None
     with open_file(path, "rb", root=root) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit or len(content := file.read(limit + 1)) > limit:
-            raise RunFileError(f"{path} must have at most {limit:,} bytes, got {size:,}; no run writes so many there.")
+            raise RunFileError(
+                f"{path} must have at most {limit:,} bytes, got {size:,}; no run writes that much there."
+            )
     return content
 
 
@@ -208,7 +210,7 @@ def remove(path: Path, *, root: Path | None = None) -> None:
 
 
 def is_hollow(path: Path) -> bool:
-    """Whether a large file is next to nothing but holes: it claims a size that nobody has written."""
+    """Whether a large file consists almost only of holes: it claims a size that nobody has written."""
     with open_file(path) as file:
         descriptor, size = file.fileno(), os.fstat(file.fileno()).st_size
         if size < 256 * MEGABYTE or not hasattr(os, "SEEK_HOLE"):
@@ -225,7 +227,7 @@ def is_hollow(path: Path) -> bool:
 
 
 def memory_of_this_machine() -> int:
-    """Bytes of its main memory; a large number where that is not told."""
+    """Bytes of its main memory; a large number where the system does not say."""
     try:
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (AttributeError, ValueError, OSError):

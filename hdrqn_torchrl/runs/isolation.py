@@ -1,4 +1,4 @@
-"""Playing beside a training without leaving a trace in it."""
+"""Playing during a training without leaving a trace in it."""
 
 from __future__ import annotations
 

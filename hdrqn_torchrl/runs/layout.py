@@ -25,7 +25,7 @@ WRITTEN = (CONFIG, ORIGIN, METRICS, ERROR, SUMMARY, CURVES)
 AT_THE_END = (ERROR, SUMMARY, CURVES)
 """Those that are out of date as soon as it goes on."""
 KEPT = (CONFIG, ORIGIN, METRICS, SUMMARY, f"{EVALUATIONS}/*.json")
-"""Patterns of those that tell what came out of it."""
+"""Patterns of the files that hold its results."""
 
 
 def holds_run(folder: Path) -> bool:

@@ -1,4 +1,4 @@
-"""One process at a time: a lock of the operating system or, where there is none, a file that says who is in."""
+"""One process at a time: a lock of the operating system or, where there is none, a file that names its owner."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def lock(path: Path, *, patience_seconds: float = 0.0, tell: Callable[[str], Non
     that file; one of a process of this machine that has died is taken over.
 
     Args:
-        path: a file for the lock; its folder must exist. The file stays, and holds who was the last to be in.
+        path: a file for the lock; its folder must exist. The file stays, and names its last owner.
         patience_seconds: how long to wait for another process.
         tell: called once, with the words for who is waited for.
 
@@ -108,11 +108,11 @@ def _flock(descriptor: int) -> bool:
 
 
 def _create(path: Path) -> Callable[[], None]:
-    """Creates the file that says that this process is in."""
+    """Creates the file that names this process as the owner."""
     for _ in range(2):
         try:
             descriptor = open_descriptor(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL)
-        except (FileExistsError, RunFileError):  # somebody is in, or something else lies there
+        except (FileExistsError, RunFileError):  # another process holds it, or something else lies there
             owner = _read(path)
             if owner is None or not _has_died(owner):
                 remedy = f"if no such process is there any more, remove {path}"
@@ -126,7 +126,7 @@ def _create(path: Path) -> Callable[[], None]:
 
 
 def _take_over(path: Path, dead: Owner) -> None:
-    """Removes the file of a dead process, unless another one has just done that and is in."""
+    """Removes the file of a dead process, unless another one has just done that and holds the lock."""
     aside = path.with_name(f"{path.name}.{os.getpid()}")
     with contextlib.suppress(FileNotFoundError):
         path.rename(aside)
@@ -159,7 +159,7 @@ def _myself() -> Owner:
 
 
 def _has_died(owner: Owner) -> bool:
-    """Whether a process of this machine is no more. Of others, and on Windows, nothing is known."""
+    """Whether a process of this machine has ended. Nothing is known about other machines, or on Windows."""
     pid = owner.get("pid")
     if owner.get("host") != socket.gethostname() or os.name != "posix" or not isinstance(pid, int) or pid <= 0:
         return False

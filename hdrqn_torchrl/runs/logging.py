@@ -88,7 +88,7 @@ class CSVLog:
         """Goes back to a position: later rows are dropped from the file, as they will be written again.
 
         Raises:
-            ValueError: if it can't be one.
+            ValueError: if it is not a valid position.
         """
         columns, rows = list(state["columns"]), state["rows"]
         if not all(isinstance(name, str) for name in columns) or type(rows) is not int or rows < 0:
@@ -167,7 +167,7 @@ class RunLogger:
         self.console.print(f"{self.label}{sentence}", highlight=False, soft_wrap=True, markup=False)
 
     def state_dict(self) -> dict[str, Any]:
-        """Its position in the files; what loggers held back is written, too."""
+        """Its position in the files; what loggers have buffered is written, too."""
         for logger in self.loggers:
             if hasattr(logger, "flush"):
                 logger.flush()
@@ -179,14 +179,14 @@ class RunLogger:
         self._last_greedy = state["last_greedy"]
 
     def close(self) -> None:
-        """Stops the progress bar and ends the loggers: what they hold back is written."""
+        """Stops the progress bar and ends the loggers: what they have buffered is written."""
         self._progress.stop()
         for logger in self.loggers:
             logger.close()
 
 
 def measured(row: Row) -> Row:
-    """The values that are numbers; a mean over nothing is NaN, and is none.
+    """The values that are numbers; a mean over nothing is NaN and is left out.
 
     Examples:
         >>> measured({"frames": 8, "legs/start_to_0": float("nan")})

@@ -17,7 +17,7 @@ from hdrqn_torchrl.envs.task import Figures, Reference, Task
 
 References = dict[str, dict[str, float]]
 LONGEST_SECONDS = 120.0
-"""What each player may need, unless one says otherwise."""
+"""Default time limit of each player."""
 
 
 def references_for(
@@ -126,7 +126,7 @@ def _kept(reference: Reference) -> Figures | None:
         return None
     try:
         kept = json.loads(_place(reference).read_text())
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: there is no home
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: there is no home folder
         return None
     if not isinstance(kept, dict) or kept.get("key") != reference.key or not isinstance(kept.get("figures"), dict):
         return None

@@ -72,7 +72,7 @@ def check_tensors(path: Path, *, root: Path | None = None) -> None:
         root: see :func:`~hdrqn_torchrl.runs.files.check_file`.
 
     Raises:
-        ValueError: if it is none, or its header or size is not what the tensors in it need.
+        ValueError: if it is not one, or its header or size is not what the tensors in it need.
     """
     with open_file(path, root=root) as file:
         size = os.fstat(file.fileno()).st_size
@@ -86,7 +86,7 @@ def check_tensors(path: Path, *, root: Path | None = None) -> None:
         except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
             raise ValueError(f"{path} must be a safetensors file, got one with another header ({error}).") from error
     if needed != size:
-        raise ValueError(f"{path} must have the {needed:,} bytes that its header tells of, got {size:,}.")
+        raise ValueError(f"{path} must have the {needed:,} bytes that its header promises, got {size:,}.")
 
 
 def _encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:

@@ -31,7 +31,7 @@ class RewindingTensorboardLogger(TensorboardLogger):
         self.experiment.purge_step = frames + 1  # read when the next file of events is begun
 
     def flush(self) -> None:
-        """Writes what is held back."""
+        """Writes what is buffered."""
         self.experiment.flush()
 
 
@@ -160,7 +160,7 @@ def _recorded(path: Path) -> str | None:
     found = read_json(path)
     run_id = found.get("id") if isinstance(found, dict) else None
     if not isinstance(run_id, str) or not re.fullmatch(r"[\w-]{1,64}", run_id):
-        raise ValueError(f"{path} must name the run that is gone on with; remove it to log the rest as a new one.")
+        raise ValueError(f"{path} must name the run to continue; remove it to log the rest as a new one.")
     return run_id
 
 

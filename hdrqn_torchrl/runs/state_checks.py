@@ -1,7 +1,7 @@
 """Entries of a stored state are held against the environment's specs before anything is loaded.
 
-A cell code, an action or a subgoal that does not exist is an index beyond a table, which ends the process or reads what
-is none of its business.
+A cell code, an action or a subgoal that does not exist is an index beyond a table, which ends the process or reads
+memory that belongs to something else.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Rule(NamedTuple):
     shape: tuple[int, ...]
     """After the batch dimensions."""
     values: int | None
-    """It lies in [0, values); ``None``: it is no choice."""
+    """It lies in [0, values); ``None``: it is not a choice."""
 
 
 def rules_of(env: EnvBase) -> dict[str, Rule]:
@@ -50,7 +50,7 @@ def check_entries(state: Any, rules: Mapping[str, Rule], path: str = "") -> None
 
     Args:
         state: what a component is going to load.
-        rules: see :func:`rules_of`; entries without one are passed over.
+        rules: see :func:`rules_of`; entries without one are skipped.
         path: where the state stands, for the message.
 
     Raises:

@@ -1,6 +1,6 @@
-"""``config.yaml`` of a run folder as plain data: dicts, lists, texts, numbers. Nothing in it is looked up or executed.
+"""``config.yaml`` of a run folder as plain data: dicts, lists, strings, numbers. Nothing is looked up or executed.
 
-A small file can stand for endless work: names for parts (aliases) that multiply, nesting that no stack holds, numbers
+A small file can stand for endless work: aliases that multiply, nesting that no stack holds, numbers
 of a million digits. All of that is refused before the data is made.
 """
 
@@ -54,10 +54,10 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
     }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        """Refuses keys that are no names, and those that stand there twice."""
+        """Refuses keys that are not names, and duplicates."""
         keys = [key.value if key.tag.endswith(":str") else None for key, _ in node.value]
         if None in keys or len(set(keys)) < len(keys):
-            raise yaml.YAMLError(f"every key must be a name and stand there once, {node.start_mark}")
+            raise yaml.YAMLError(f"every key must be a name and occur only once, {node.start_mark}")
         return super().construct_mapping(node, deep)
 
 
@@ -74,7 +74,7 @@ def read_settings(path: Path, *, keep_unknown: bool = False) -> dict[str, Any]:
 
     Args:
         path: the file.
-        keep_unknown: leave texts that refer to something else as they stand, to be shown; without it they are refused,
+        keep_unknown: leave strings that refer to something else unchanged, to be shown; without it they are refused,
             apart from those that earlier versions wrote, which are replaced by what they meant in any case.
 
     Raises:
@@ -97,9 +97,9 @@ def _parse(text: str) -> Any:
     depth = 0
     for event in yaml.parse(text, _Loader):
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise ValueError("names for parts (& and *) must not stand in it")
+            raise ValueError("it must not contain anchors and aliases (& and *)")
         if getattr(event, "tag", None) is not None and event.tag != "!":
-            raise ValueError(f"types of values must not be named in it, got {event.tag[:80]}")
+            raise ValueError(f"it must not contain tags (!...), got {event.tag[:80]}")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > LARGEST_DEPTH:
             raise ValueError(f"settings must not be nested more than {LARGEST_DEPTH} deep")
@@ -157,7 +157,7 @@ def _shown(reference: str, path: str, found: dict[str, Any], plain: dict[str, An
 
 
 def check_plain(settings: Any, path: str = "") -> None:
-    """Refuses what becomes something else when it is used (references to other settings), and numbers that are none.
+    """Refuses NaN, and values that refer to other settings: those would become something else when used.
 
     Raises:
         ValueError: naming the setting.

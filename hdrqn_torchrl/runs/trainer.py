@@ -185,7 +185,7 @@ class Trainer:
         return best
 
     def _begin_row(self) -> None:
-        """Starts counting anew; only now that a row is on the disk: a stop before would lose what was counted."""
+        """Starts counting again; only now that a row is on the disk: a stop before would lose what was counted."""
         self._window = Window(self.frames)
         for monitor in self.algorithm.monitors.values():
             monitor.clear()
@@ -219,8 +219,8 @@ class Trainer:
         self._saved_at, self._saved_position = time.monotonic(), self._position
         if missing and not any(len(learner.buffer) for learner in self.algorithm.learners.values()):
             self.logger.say(
-                f"{path.name} holds no replay memory: it begins empty and is warmed up anew, so that the training goes "
-                "on, but not bit for bit as it would have"
+                f"{path.name} holds no replay memory: it begins empty and is warmed up again, so that the training "
+                "goes on, but not bit for bit as it would have"
             )
 
     @property
@@ -253,7 +253,7 @@ class Trainer:
         """Restores what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if it can't be what a trainer returned.
+            ValueError: if it is not the state of a trainer.
         """
         check_counters(state)
         self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
@@ -270,7 +270,7 @@ def crossed(before: int, after: int, interval: int) -> bool:
 
 @contextmanager
 def _naming(learner: str) -> Iterator[None]:
-    """Puts the learner's name before its complaint."""
+    """Puts the learner's name before its error."""
     try:
         yield
     except NonFiniteError as error:

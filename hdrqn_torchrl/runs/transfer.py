@@ -19,7 +19,7 @@ _SHOWN = 3  # weights that a message names
 
 
 def find_weights(place: Path, which: str = "best") -> Path:
-    """Where the weights lie that a user means.
+    """The checkpoint or file that holds the weights that a user means.
 
     Args:
         place: a run folder, a checkpoint, or a file of :func:`~hdrqn_torchrl.runs.weights.save_weights`.
@@ -39,7 +39,7 @@ def find_weights(place: Path, which: str = "best") -> Path:
     except (CheckpointError, OSError) as error:
         raise ValueError(f"init_from can't be read: {error}") from error
     if path is None:
-        raise ValueError(f"init_from must be a run folder, a checkpoint or a weights file, got {place}; it is none.")
+        raise ValueError(f"init_from must be a run folder, a checkpoint or a weights file, got {place}.")
     return path
 
 

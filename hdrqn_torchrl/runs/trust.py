@@ -41,7 +41,7 @@ BUILDERS = {
         "hdrqn_torchrl.runs.logging.make_mlflow_logger",
     ),
 }
-"""What a ``_target_`` may name, by its place; one's own are added with ``allowed_targets=[package.builder]``."""
+"""What a ``_target_`` may name, by its place; a user's own are added with ``allowed_targets=[package.builder]``."""
 
 ALLOWED_TARGETS = tuple(target for targets in BUILDERS.values() for target in targets)
 _LOGGER = re.compile(r"logger\.loggers\[\d+\]")
@@ -69,7 +69,7 @@ LARGEST = {
     "capacity": 20_000_000,
     "window": 100_000,
 }
-"""Sizes that something is made of; larger ones are mistakes, or mean to fill the memory of who looks at a run."""
+"""Sizes that something is made of; larger ones are mistakes, or meant to fill the memory of whoever opens a run."""
 _LARGEST_NUMBER, _LONGEST_LIST = 10**18, 64  # of whole numbers of any other kind, and of lists of sizes
 
 
@@ -118,7 +118,7 @@ def _builders_at(path: str) -> tuple[str, ...]:
 
 
 def check_sizes(settings: Settings, place: str) -> None:
-    """Refuses sizes beyond all measure (:data:`LARGEST`).
+    """Refuses unreasonably large sizes (:data:`LARGEST`).
 
     Raises:
         SettingsError: naming setting, rule and value.

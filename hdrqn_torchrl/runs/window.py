@@ -82,7 +82,7 @@ def check_counters(state: dict[str, Any]) -> None:
         state: what :meth:`~hdrqn_torchrl.runs.trainer.Trainer.state_dict` returned, read from a file.
 
     Raises:
-        ValueError: if a count or a time is no number of its kind, or a sum has another shape.
+        ValueError: if a count or a time is not a number of its kind, or a sum has another shape.
     """
     window, sums = state["window"], state["tracker"]["sums"]
     counts = [state["frames"], state["episodes"], window["frames"], state["completed"] or 0, *window["counts"].values()]

@@ -1,4 +1,4 @@
-"""Subgoals of one's own for any environment: a function says which of them a step attained."""
+"""Custom subgoals for any environment: a function says which of them a step attained."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.transforms.entries import set_spec
 
 Verdict = Callable[[TensorDictBase], Tensor]
-"""From what follows a step ``[*batch]``, which subgoals the step attained, ``[*batch, G]`` bool."""
+"""Returns the subgoals that a step attained, ``[*batch, G]`` bool, from what follows the step ``[*batch]``."""
 
 
 class Critic(Transform):
-    """Writes ``attained`` as a function has it; what the environment itself wrote there is replaced.
+    """Writes ``attained`` as a function computes it; what the environment itself wrote there is replaced.
 
-    An environment with it has all that builders ask for, at every level: the option book, losses that teach all
-    subgoals, hindsight and what is counted read the same entry.
+    An environment with it has all that builders require, at every level: the option book, losses that teach all
+    subgoals, hindsight and the monitors read the same entry.
 
     Args:
         num_subgoals: G.

@@ -1,4 +1,4 @@
-"""What the critic pays for a step: the one place where that rule stands."""
+"""The reward that the critic pays for a step: the only place with that rule."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 class IntrinsicReward:
     """The intrinsic reward of a step, for the subgoal that is pursued or for all of them.
 
-    The option book pays by it (:class:`~hdrqn_torchrl.transforms.SubgoalTransform`), hindsight tells others' steps by
+    The option book pays by it (:class:`~hdrqn_torchrl.transforms.SubgoalTransform`), hindsight relabels steps by
     it (:func:`~hdrqn_torchrl.data.relabel_subgoals`), and losses that teach all subgoals from every step use it.
 
     Args:
@@ -81,11 +81,11 @@ def penalties_of_sets(wrong_subgoal_reward: float | Sequence[float], number: int
 
     Args:
         wrong_subgoal_reward: one number is for the farthest set, as nearer subgoals are passed on the way to others;
-            or one number for each set.
+            or a list of one number for each set.
         number: of sets.
 
     Raises:
-        ValueError: if there is one number for each of another number of sets.
+        ValueError: if the list has another length than ``number``.
 
     Examples:
         >>> penalties_of_sets(-0.5, 2)

@@ -50,7 +50,7 @@ class SubgoalTransform(Transform):
         repeatable: whether a subgoal can be attained more than once in an episode. If not,
             ``subgoal_mask`` excludes what was attained, and an option that pursues it ends after one step.
         available_key: subgoals that are worth choosing now ``[*batch, G]``, written by the environment; it becomes
-            ``subgoal_mask``, and ``repeatable`` is not asked. ``None``: the environment says nothing about it.
+            ``subgoal_mask``, and ``repeatable`` is ignored. ``None``: the environment says nothing about it.
         critic: computes ``attained`` ``[*batch, G]`` from the tensordict that follows a step, and it is written as
             such (:class:`~hdrqn_torchrl.transforms.Critic`). ``None``: the environment has to write it.
         prefix: of the names of all entries that concern this set of subgoals (:class:`~hdrqn_torchrl.keys.OptionKeys`),
@@ -268,7 +268,7 @@ def advance_option(
     """The book of an option after one more step: rule 4 of :class:`SubgoalTransform`.
 
     Args:
-        init: whether the step is the option's first, ``[*, 1]`` bool; then what stood in the book is void.
+        init: whether the step is the option's first, ``[*, 1]`` bool; the book is then void.
         steps, collected: how long the option has lasted and what it has collected, ``[*, 1]``.
         reward: extrinsic reward of the step, ``[*, 1]``.
         gamma: discount inside an option.

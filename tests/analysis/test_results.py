@@ -91,7 +91,7 @@ class TestReading:
             ("frames\n", None, "no complete log point"),
             ("loss\n1\n", None, "no complete log point"),
             ("frames\n1\n", "[1", "summary.json must be a JSON file"),
-            ("frames\nnan\n", None, "must tell the frames of every row"),
+            ("frames\nnan\n", None, "must hold the frames of every row"),
             ("frames\n1\n", "[1]", "summary.json must hold"),
         ],
     )

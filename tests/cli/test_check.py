@@ -1,4 +1,4 @@
-"""check.py: the contract of tasks on the command line."""
+"""check.py: the contract for tasks on the command line."""
 
 import pytest
 
@@ -24,13 +24,13 @@ def test_a_task_of_the_package_has_no_fault_and_no_folder_is_made(run, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_environment_in_a_configuration_folder_of_ones_own(run, tmp_path):
+def test_an_environment_of_a_users_configuration_folder_is_checked(run, tmp_path):
     (tmp_path / "env").mkdir()
     (tmp_path / "env" / "small.yaml").write_text("defaults:\n  - gridworld\n  - _self_\nmax_steps: 5\n")
     assert run("env=small", "--config-dir", str(tmp_path)) == (0, "nothing is wrong or missing\n")
 
 
-def test_what_is_wrong_ends_it_with_1(run, monkeypatch):
+def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
     monkeypatch.setattr(check, "check_settings", lambda settings: ["wrong: 'reward' is missing (no agent)"])
     assert run("env=gridworld") == (1, "wrong: 'reward' is missing (no agent)\n")
 
@@ -44,12 +44,12 @@ def test_what_is_wrong_ends_it_with_1(run, monkeypatch):
         ("env.veiw=4", "error: Could not override 'env.veiw'."),
     ],
 )
-def test_a_wrong_argument_is_told(run, argument, told):
+def test_a_wrong_argument_is_reported(run, argument, told):
     code, _ = run(argument)
     assert code.startswith(told) and "\n" not in code
 
 
-def test_help(monkeypatch, capsys):
+def test_help_shows_the_usage(monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["hdrqn check", "--help"])
     check.main()
     assert "hdrqn check env=gridworld" in capsys.readouterr().out

@@ -41,7 +41,7 @@ class TestCommandLine:
         ["a #b", "a: b", "{a", "*a", "!a", "&a", "123", "1e3", "null", "true", "~", "-", "a b", "[a", "'a", '"a"',
          "a=b", "${oc.env:HOME}", "a, b", "%a", "@a", "`a", "|", ">", "", "2026-11-27"],
     )  # fmt: skip
-    def test_a_name_is_taken_as_it_stands(self, call, name):
+    def test_a_name_is_taken_literally(self, call, name):
         settings = call(f"run={name}", f"out={name}", f"files={name}")
         assert settings == Settings(name, 10, name, None if name == "null" else name)
 
@@ -49,7 +49,7 @@ class TestCommandLine:
         assert call("run=a", "files=[a,'b #c']").files == ["a", "b #c"]
 
     @pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["run=a", "--help"]], ids=str)
-    def test_help(self, call, capsys, arguments):
+    def test_help_is_printed_when_asked_for(self, call, capsys, arguments):
         with pytest.raises(SystemExit) as stop:
             call(*arguments)
         assert stop.value.code == 0 and capsys.readouterr().out == "What it does.\n"
@@ -73,12 +73,12 @@ class TestCommandLine:
             (["run=a", "episodes=[1"], "error: "),
         ],
     )
-    def test_a_wrong_one(self, call, arguments, message):
+    def test_a_wrong_argument_is_refused(self, call, arguments, message):
         with pytest.raises(SystemExit) as stop:
             call(*arguments)
         assert str(stop.value.code).startswith(message) and "\n" not in stop.value.code
 
-    def test_settings_that_turn_out_to_be_wrong(self, monkeypatch):
+    def test_a_settings_error_during_the_run_ends_it_with_a_message(self, monkeypatch):
         def work(_):
             raise SettingsError("run must be a folder.")
 

@@ -13,7 +13,7 @@ from hdrqn_torchrl.runs.settings import check
 
 
 @pytest.mark.parametrize("name", ["drqn", "v1", "v2", "v3"])
-def test_one_precision_for_all_learners(name):
+def test_all_learners_have_one_precision(name):
     small = ["env.num_envs=4", "network.hidden_size=8", "network.widths=[8]"]
     with initialize_config_dir(CONF, version_base="1.3"):
         config = compose("config", overrides=[f"algo={name}", "precision=fp32", *small])
@@ -25,7 +25,7 @@ def test_one_precision_for_all_learners(name):
 
 
 @pytest.mark.parametrize(
-    ("chosen", "fine"),
+    ("chosen", "penalty"),
     [
         (["env=gridworld", "algo=v3"], -0.5),  # where goals have an order
         (["env=four_rooms", "algo=v3"], -0.5),
@@ -38,9 +38,9 @@ def test_one_precision_for_all_learners(name):
     ],
     ids=str,
 )
-def test_what_another_subgoal_costs(chosen, fine):
+def test_the_penalty_for_a_wrong_subgoal_follows_the_task(chosen, penalty):
     with initialize_config_dir(CONF, version_base="1.3"):
-        assert compose("config", overrides=chosen).algo.wrong_subgoal_reward == fine
+        assert compose("config", overrides=chosen).algo.wrong_subgoal_reward == penalty
 
 
 VARIANTS = sorted(path.stem for path in (Path(CONF) / "variant").glob("*.yaml"))
@@ -48,7 +48,7 @@ VARIANTS = sorted(path.stem for path in (Path(CONF) / "variant").glob("*.yaml"))
 
 class TestVariants:
     @pytest.mark.parametrize("name", VARIANTS)
-    def test_each_can_be_built_and_differs_from_its_algorithm(self, name):
+    def test_each_variant_can_be_built_and_differs_from_its_algorithm(self, name):
         small = ["env.num_envs=4", "network.hidden_size=8", "network.widths=[8]"]
         with initialize_config_dir(CONF, version_base="1.3"):
             config = compose("config", overrides=[f"variant={name}", *small])
@@ -57,7 +57,7 @@ class TestVariants:
         build_algorithm(resolved(config))
         assert ((config.algo, config.env) != (plain.algo, plain.env)) == ("_" in name)
 
-    def test_each_stands_in_an_experiment(self):
+    def test_each_variant_belongs_to_an_experiment(self):
         used = set()
         for name in ("ablation", "authors_choices"):
             sweep = OmegaConf.load(Path(CONF) / "experiment" / f"{name}.yaml").hydra.sweeper.params

@@ -31,7 +31,7 @@ def call(run, monkeypatch, capsys):
     return call
 
 
-def test_it_finds_what_the_run_found_at_its_end(run, call):
+def test_the_last_checkpoint_scores_as_in_the_final_evaluation_of_its_run(run, call):
     """The last checkpoint, played in the same worlds as the run's final evaluation."""
     result = call("checkpoint=last", "episodes=8", "num_envs=8")
     summary = json.loads((run / "summary.json").read_text())
@@ -40,7 +40,7 @@ def test_it_finds_what_the_run_found_at_its_end(run, call):
     assert result["seed"] == 1_000_001  # not the 1_000_000 of the evaluations that chose the best checkpoint
 
 
-def test_what_it_says(call):
+def test_the_printed_result_holds_means_intervals_and_the_ceiling(call):
     result = call("episodes=32", "num_envs=16")
     assert result["episodes"] == 32 and result["epsilon"] == 0.0 and result["env"]["max_steps"] == 10
     for name, interval in result["intervals"].items():
@@ -106,7 +106,7 @@ def test_the_object_can_be_written_to_a_file(call, tmp_path):
         (["episodes"], "must read key=value, got 'episodes'"),
     ],
 )
-def test_wrong_arguments_are_told(call, arguments, part):
+def test_wrong_arguments_are_reported(call, arguments, part):
     with pytest.raises(SystemExit, match=part):
         call(*arguments)
 
@@ -125,7 +125,7 @@ def test_results_come_before_figures_and_survive_them(run, monkeypatch, capsys, 
     assert result["ceiling"] is None and result["references"] == {}
 
 
-def test_help_and_missing_arguments(monkeypatch, capsys):
+def test_help_is_printed_and_a_missing_argument_is_named(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["evaluate.py", "--help"])
     with pytest.raises(SystemExit) as stop:
         command_line(evaluate.Settings, evaluate.__doc__, evaluate.run)

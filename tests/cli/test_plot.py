@@ -82,7 +82,7 @@ def reference_lines(figure):
     ]
 
 
-def test_the_contract(run, outputs, figures):
+def test_curves_are_drawn_by_algorithm_with_ceilings(run, outputs, figures):
     out, err = run("runs=outputs/**", "out=figure.png")
     assert Path("figure.png").read_bytes().startswith(b"\x89PNG")
     assert out == "figure.png: runs 4, groups 2, tasks 1\n" and err == ""
@@ -95,7 +95,7 @@ def test_the_contract(run, outputs, figures):
 @pytest.mark.parametrize(
     ("kind", "endings"), [("curves", ["png", "csv"]), ("greedy", ["svg", "csv"]), ("bars", ["pdf", "csv"])]
 )
-def test_every_kind_and_format(run, outputs, kind, endings):
+def test_every_kind_is_drawn_in_every_format(run, outputs, kind, endings):
     names = ",".join(f"new/a.{ending}" for ending in endings)
     run("runs=outputs", f"kind={kind}", f"out=[{names}]", "columns=greedy/return", "ceilings=none")
     starts = {"png": b"\x89PNG", "svg": b"<?xml", "pdf": b"%PDF", "csv": b"task,group,metric"}
@@ -119,10 +119,10 @@ def test_final_results_of_unfinished_runs_are_their_last_evaluation(run, outputs
     last = [returns["dqn"][name] for name in ("axis", "estimate", "low", "high")]
     assert last == ["final", "1", "-5.35310237", "7.35310237"]
     assert returns["v2"]["estimate"] == "2"
-    assert "dqn: unfinished are 1 of 2 runs" in err and "v2: unfinished" not in err
+    assert "dqn: 1 of 2 runs are unfinished" in err and err.count("unfinished") == 1
 
 
-def test_how_long_it_took(run, outputs):
+def test_time_to_a_threshold_is_averaged_only_if_all_runs_reach_it(run, outputs):
     _, err = run(
         "runs=outputs", "out=[table.csv,a.png]", "kind=bars", "columns=[wall_seconds until behaviour/return>=3]"
     )
@@ -135,13 +135,13 @@ def test_how_long_it_took(run, outputs):
 @pytest.mark.parametrize(
     ("x", "last"), [("frames", "400"), ("episodes", "28"), ("updates", "40"), ("wall_seconds", "242")]
 )
-def test_any_axis(run, outputs, x, last):
+def test_any_clock_can_be_the_x_axis(run, outputs, x, last):
     run("runs=outputs", "out=[table.csv,a.png]", f"x={x}", "ceilings=none")
     assert {row["axis"] for row in table()} == {x}
     assert [row["x"] for row in table() if row["group"] == "v2"][-1] == last
 
 
-def test_groups_of_nested_settings(run, tmp_path):
+def test_runs_can_be_grouped_by_nested_settings(run, tmp_path):
     for length in (8, 16):
         make_run(tmp_path / f"outputs/{length}", length=length)
     _, err = run("runs=outputs", "out=table.csv", "by=algo.sub.slice_len", "ceilings=none")
@@ -157,7 +157,7 @@ def test_runs_that_should_not_be_pooled_are_noted(run, tmp_path):
         make_run(tmp_path / f"outputs/{length}", length=length)
     _, err = run("runs=outputs", "out=table.csv", "by=null", "ceilings=none")
     assert groups_of(table()) == ["all"]
-    assert "note: all puts runs together that differ in algo.sub.slice_len;" in err
+    assert "note: all combines runs that differ in algo.sub.slice_len;" in err
     assert "note: all: several runs with seed 0;" in err
 
 
@@ -182,7 +182,7 @@ def test_pooled_tasks_share_only_the_ceilings_that_are_the_same(run, tmp_path, f
     assert [last[name] for name in ("group", "estimate", "low", "high", "seeds")] == ["v2", "8", "", "", "4"]
     make_run(tmp_path / "outputs/5-2", view=5, seed=2, offset=5)
     _, err = run("runs=outputs", "out=table.csv", "pool=true", "columns=behaviour/return", "ceilings=none")
-    assert err == "note: v2: tasks have 2 to 3 runs; each run counts alike, so tasks do not\n"
+    assert err == "note: v2: tasks have 2 to 3 runs; each run has the same weight, so tasks do not\n"
 
 
 def test_an_unmeasured_task_shows_the_ceiling_that_was_logged(run, tmp_path, figures):
@@ -198,13 +198,13 @@ def test_an_unmeasured_task_can_be_simulated(run, tmp_path, figures):
     assert 2 > planner > memory > egocentric > random
 
 
-def test_no_ceilings(run, outputs, figures):
+def test_ceilings_can_be_left_out(run, outputs, figures):
     run("runs=outputs", "out=a.png", "ceilings=none")
     assert reference_lines(figures[0]) == [[], []]
 
 
 @pytest.mark.parametrize(("center", "estimate"), [("mean", "24"), ("iqm", "5")])
-def test_center(run, tmp_path, center, estimate):
+def test_the_center_is_the_mean_or_the_iqm(run, tmp_path, center, estimate):
     for seed, offset in enumerate((0, 1, 1, 94)):
         make_run(tmp_path / f"outputs/{seed}", seed=seed, offset=offset)
     _, err = run("runs=outputs", "out=table.csv", f"center={center}", "columns=behaviour/return", "ceilings=none")
@@ -217,7 +217,7 @@ def test_the_iqm_of_few_runs_says_that_it_is_the_mean(run, outputs):
     assert "note: v2: the IQM of fewer than 4 runs cuts nothing off" in err
 
 
-def test_smoothing(run, tmp_path):
+def test_smoothing_averages_neighbouring_log_points(run, tmp_path):
     make_run(tmp_path / "outputs/a")
     run("runs=outputs", "out=table.csv", "smooth=3", "columns=behaviour/return", "ceilings=none")
     assert [float(row["estimate"]) for row in table()] == [1.5, 2, 3, 3.5]
@@ -297,7 +297,7 @@ def test_only_broken_runs_are_refused(run, tmp_path):
     assert err == "error: runs must match at least one readable run; all 1 found were left out."
 
 
-def test_as_a_program_without_torch(outputs, tmp_path):
+def test_the_program_draws_without_loading_torch(outputs, tmp_path):
     """It starts fast: torch is loaded only to look up ceilings."""
     code = (
         "import runpy, sys; sys.argv = ['plot.py', *sys.argv[1:]]; "

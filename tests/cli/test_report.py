@@ -66,10 +66,10 @@ def outputs(tmp_path):
     return tmp_path / "outputs"
 
 
-def test_figures_tables_and_claims_of_a_study(run, outputs):
+def test_a_report_holds_figures_tables_and_claims_of_a_study(run, outputs):
     assert run("runs=outputs", "out=results.md", "studies=gridworld") == "gridworld: runs 7, missing 11\n"
     text = Path("results.md").read_text()
-    assert "`python train.py -m experiment=gridworld` (runs that have not been made to their end yet: 12 of 18)" in text
+    assert "`python train.py -m experiment=gridworld` (unfinished runs: 12 of 18)" in text
     row = next(line for line in text.splitlines() if line.startswith("| v2 |"))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     expected = "v2", "0, 1", "1.60", "1.54 to 1.67", "", "80%", "80%", "75%", "21.0", "0k", "1 min", "0123456"
@@ -82,7 +82,7 @@ def test_figures_tables_and_claims_of_a_study(run, outputs):
     assert "(results/gridworld.png)" in text
 
 
-def test_claims_are_held_against_finished_runs(run, outputs):
+def test_claims_are_checked_against_finished_runs(run, outputs):
     for algo, score in (("hdqn", 0.8), ("drqn", 0.3)):
         make_run(outputs / f"done-{algo}", "experiment=gridworld", f"algo={algo}", score=score)
     run("runs=outputs", "out=results.md", "studies=gridworld")
@@ -92,7 +92,7 @@ def test_claims_are_held_against_finished_runs(run, outputs):
     assert "claims small" not in text  # of some studies alone there is no overview
 
 
-def test_overview_of_all_claims(run, outputs):
+def test_a_report_on_all_studies_begins_with_an_overview_of_claims(run, outputs):
     run("runs=outputs", "out=results.md")
     overview = Path("results.md").read_text().partition("<!-- claims small -->")[2]
     assert "| study | claim (of greedy play at the end) | | measured |\n|---|---|---|---|" in overview
@@ -102,7 +102,7 @@ def test_overview_of_all_claims(run, outputs):
     )
 
 
-def test_what_people_wrote_is_left_as_it_is(run, outputs):
+def test_text_outside_the_marks_is_left_unchanged(run, outputs):
     run("runs=outputs", "out=results.md", "studies=gridworld")
     generated = Path("results.md").read_text()
     Path("results.md").write_text(generated.replace("# Results\n", "# Ours\n\nBefore.\n") + "\nAfter.\n")
@@ -119,7 +119,7 @@ def test_an_archive_gives_the_same_report(run, outputs):
     assert (Path("a") / "gridworld.png").read_bytes() == (Path("b") / "gridworld.png").read_bytes()
 
 
-def test_rows_of_a_study_and_agents_beside_it(run, tmp_path):
+def test_a_study_has_a_row_for_each_value_and_shows_other_agents_for_comparison(run, tmp_path):
     for algo in ("v1", "v2"):
         for length in (1, 8):
             settings = f"algo={algo}", f"algo.sub.slice_len={length}", "algo.meta.slice_len=1"
@@ -130,7 +130,7 @@ def test_rows_of_a_study_and_agents_beside_it(run, tmp_path):
     assert text.index("**v1**") < text.index("| slice_len=1 |") < text.index("| v3 |") < text.index("**v2**")
 
 
-def test_a_run_stands_for_what_a_study_calls_it(run, outputs):
+def test_a_run_has_the_label_that_its_study_gives_it(run, outputs):
     """The variant v2 of one study is the algorithm v2 of another."""
     make_run(outputs / "cell", "experiment=authors_choices", "variant=v2_cell")
     assert run("runs=outputs", "out=results.md", "studies=authors_choices") == "authors_choices: runs 3, missing 15\n"
@@ -162,7 +162,7 @@ class TestScreen:
             (folder / f"evaluations/{name}.json").write_text(json.dumps(result))
         return folder
 
-    def test_table_and_figures(self, run, folder):
+    def test_the_screen_study_has_a_table_and_figures(self, run, folder):
         assert run("runs=outputs", "out=results.md", "studies=montezuma") == "montezuma: runs 1, missing 5\n"
         text = Path("results.md").read_text()
         rows = [line for line in text.splitlines() if line.startswith("| v3")]
@@ -173,7 +173,7 @@ class TestScreen:
         for name in ("montezuma", "montezuma_right", "montezuma_left", "montezuma_legs_v3"):
             assert f"(results/{name}.png)" in text and (Path("results") / f"{name}.png").stat().st_size > 100
 
-    def test_an_archive_keeps_evaluations(self, run, folder):
+    def test_an_archive_keeps_evaluations_of_the_screen(self, run, folder):
         run("runs=outputs", "out=a.md", "studies=montezuma", "keep=runs.tar.xz")
         run("runs=runs.tar.xz", "out=b.md", "studies=montezuma")
         assert Path("b.md").read_text() == Path("a.md").read_text().replace("(a/", "(b/")
@@ -193,7 +193,7 @@ def test_runs_of_another_size_do_not_count(run, outputs):
         (["runs=broken.tar.xz"], "error: runs must name folders or readable archives, got broken.tar.xz: "),
     ],
 )
-def test_wrong_settings(run, outputs, arguments, message):
+def test_wrong_settings_are_refused(run, outputs, arguments, message):
     Path("broken.tar.xz").write_text("no archive")
     assert re.match(message, run("runs=outputs", *arguments))
 
@@ -203,7 +203,7 @@ class TestStudies:
         assert sorted(study.name for study in STUDIES if "paper" in study.sizes) == EXPERIMENTS
 
     @pytest.mark.parametrize("study", [each for each in STUDIES if "paper" in each.sizes], ids=lambda study: study.name)
-    def test_jobs_of_both_sizes(self, study):
+    def test_a_study_has_jobs_in_both_sizes(self, study):
         small, paper = jobs_of(study.name), jobs_of(f"paper/{study.name}")
         assert len(small) == len(paper) >= 9
         assert all(is_run_of(job, other.settings) == (job is other) for job in small for other in small)
@@ -213,8 +213,8 @@ class TestStudies:
         assert all(job.label(study.by) for job in small)
 
     @pytest.mark.parametrize("study", [each for each in STUDIES if each.claims], ids=lambda study: study.name)
-    def test_claims_are_about_groups_that_there_are(self, study):
-        """One that names another group would never be held against anything."""
+    def test_claims_name_groups_that_exist(self, study):
+        """A claim about another group would never be checked."""
         labels = {job.label(study.by) for job in jobs_of(study.name)}
         rows = {job.label([study.rows]) for job in jobs_of(study.name)} if study.rows else set()
         for claim in study.claims:
@@ -232,7 +232,7 @@ class TestStudies:
         assert all(each == tried["v2"] for each in tried.values())
         assert len(tried["v2"]) == 4
 
-    def test_what_runs_have_in_common(self):
+    def test_a_run_belongs_to_a_job_if_the_settings_of_both_agree(self):
         found = {"seed": 0, "output_root": "a", "algo": {"gamma": 0.9, "tau": 0.1}, "resume": None}
         settings = flat(found, without=NOT_LEARNED_FROM)
         assert settings == {"seed": 0, "algo.gamma": 0.9, "algo.tau": 0.1}
@@ -243,8 +243,8 @@ class TestStudies:
         assert not is_run_of(job, settings | {"algo.other": 1})
 
 
-def test_the_kept_runs_are_still_those_of_their_study():
-    """Settings that were renamed or left to the task since they were made must not make strangers of them."""
+def test_the_kept_runs_still_belong_to_their_studies():
+    """Settings that were renamed or left to the task since they were made must not keep them from matching."""
     with ExitStack() as stack:
         kept = findings.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
         found, missing = findings.runs_of_jobs("gridworld", "small", kept)
@@ -254,7 +254,7 @@ def test_the_kept_runs_are_still_those_of_their_study():
     assert len(of_authors) > 0
 
 
-def test_a_bound_that_a_job_leaves_to_the_task_is_not_asked_for():
+def test_a_bound_that_a_job_leaves_to_the_task_is_not_compared():
     job = Job({}, {"algo.sub.max_target": None, "algo.gamma": 0.9})
     assert is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.9})
     assert not is_run_of(job, {"algo.sub.max_target": 1.0, "algo.gamma": 0.99})

@@ -1,4 +1,4 @@
-"""Where a training starts: anew, or where an earlier one stopped."""
+"""Where a training starts: in a new folder, or where an earlier one stopped."""
 
 import json
 import os
@@ -46,7 +46,7 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 
 def make_run(folder, *overrides):
-    """What a run with these settings leaves; returns its folder."""
+    """Writes the files of a run with these settings; returns its folder."""
     folder = Path(folder)
     config = compose_with_hydra(*SMALL, *overrides)
     folder.mkdir(parents=True)
@@ -61,7 +61,7 @@ def plan_for(*overrides, folder="outputs/gridworld-v2/new"):
 
 
 class TestANewRun:
-    def test_it_starts_in_hydras_folder(self):
+    def test_a_new_run_starts_in_hydras_folder(self):
         run = plan_for("seed=3", "algo=drqn")
         assert (run.folder, run.config.seed, run.resumed, run.checkpoint) == (
             Path("outputs/gridworld-v2/new"), 3, False, None,
@@ -69,7 +69,7 @@ class TestANewRun:
         assert (run.choices["algo"], run.choices["env"]) == ("drqn", "gridworld")
 
     @pytest.mark.parametrize("content", ["config.yaml", "checkpoints"])
-    def test_it_does_not_overwrite_another(self, content):
+    def test_a_new_run_does_not_overwrite_another(self, content):
         folder = Path("taken")
         (folder / content).mkdir(parents=True)
         assert holds_run(folder)
@@ -82,7 +82,7 @@ class TestANewRun:
         "name",
         ["run", "a b", "a#b", "a=b,c", "(a) [b]", "jörg's", 'a"b', "~a", "@a%b", "null", "true", "1e3", "007"],
     )
-    def test_the_command_that_goes_on_can_be_typed_as_it_is_printed(self, name):
+    def test_the_command_to_resume_can_be_typed_as_it_is_printed(self, name):
         words = shlex.split(command(Path(name), ["mine.Env", "mine.network"]))
         resume, allowed = OverridesParser.create().parse_overrides(words[2:])
         assert words[:2] == ["python", "train.py"]
@@ -91,13 +91,13 @@ class TestANewRun:
     def test_a_folder_called_auto_is_not_taken_for_the_newest_run(self):
         assert command(Path("auto")) == "python train.py resume=./auto"
 
-    def test_a_folder_that_would_be_a_reference_is_named_from_here(self, tmp_path, monkeypatch):
+    def test_a_folder_whose_full_path_looks_like_a_reference_is_named_by_its_relative_path(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "${here}").mkdir()
         monkeypatch.chdir(tmp_path / "${here}")
         assert command(Path.cwd() / "out") == "python train.py resume=out"
 
-    def test_or_refused_if_it_is_one_from_here_too(self):
+    def test_a_folder_whose_relative_path_looks_like_a_reference_is_refused(self):
         with pytest.raises(
             SettingsError, match=r"^hydra\.run\.dir must be a folder without \$\{ in its name, got a\$\{b"
         ):
@@ -110,17 +110,17 @@ class TestANewRun:
             plan_for("variant=v2_lambda", "algo=v3")
         assert plan_for("variant=v2_lambda", "algo=v2").choices["algo"] == "v2"
 
-    def test_the_command_that_goes_on_names_no_builders_where_none_were_added(self):
+    def test_the_command_to_resume_names_no_builders_if_none_were_allowed(self):
         assert command(Path("out/run")) == "python train.py resume=out/run"
 
-    def test_any_other_file_there_is_no_run(self):
+    def test_a_folder_with_other_files_does_not_count_as_a_run(self):
         Path("used").mkdir()
         (Path("used") / "notes.txt").write_text("mine")
         assert not holds_run(Path("used")) and not plan_for(folder="used").resumed
 
 
 class TestResumingAFolder:
-    def test_all_settings_are_those_of_the_run(self):
+    def test_a_resumed_run_keeps_all_its_settings(self):
         run = make_run("outputs/a/1", "seed=7", "algo.gamma=0.9", "algo=v1", "env=four_rooms")
         found = plan_for(f"resume={run}")
         assert (found.folder, found.resumed, found.checkpoint) == (run, True, None)
@@ -128,7 +128,7 @@ class TestResumingAFolder:
         assert (found.choices["algo"], found.choices["env"]) == ("v1", "four_rooms")
         check(found.config)
 
-    def test_the_folder_that_hydra_made_for_it_goes_away(self):
+    def test_resuming_removes_the_new_folder_that_hydra_made(self):
         run = make_run("outputs/a/1")
         plan_for(f"resume={run}", folder="outputs/b/new")
         assert sorted(path.name for path in Path("outputs").iterdir()) == ["a"]
@@ -137,12 +137,12 @@ class TestResumingAFolder:
         plan_for(f"resume={run}", folder="outputs/c/new")
         assert (Path("outputs") / "c" / "new" / "mine").exists()
 
-    def test_total_frames_may_be_raised_and_what_follows_them_follows(self):
+    def test_total_frames_can_be_raised_and_settings_that_follow_them_are_raised_too(self):
         run = make_run("outputs/a/1", "total_frames=1000")
         found = plan_for(f"resume={run}", "total_frames=3000")
         assert found.config.total_frames == 3000 == found.config.algo["sub"]["learning_rate_frames"]
 
-    def test_but_not_lowered(self):
+    def test_total_frames_can_not_be_lowered(self):
         run = make_run("outputs/a/1", "total_frames=1000")
         with pytest.raises(SettingsError, match=r"total_frames: 1000 -> 500 \(it can only be raised\)"):
             plan_for(f"resume={run}", "total_frames=500")
@@ -160,7 +160,7 @@ class TestResumingAFolder:
             "Leave them out, or take the new ones with resume_override=true.",
         ]
 
-    def test_unless_they_are_taken_on_purpose(self):
+    def test_other_settings_are_taken_with_resume_override(self):
         run = make_run("outputs/a/1", "seed=1")
         found = plan_for(f"resume={run}", "seed=2", "algo.sub.tau=0.5", "resume_override=true", "total_frames=5")
         assert (found.config.seed, found.config.algo["sub"]["tau"], found.config.total_frames) == (2, 0.5, 5)
@@ -169,7 +169,7 @@ class TestResumingAFolder:
     @pytest.mark.parametrize(
         "override", ["checkpoint.interval_frames=7", "checkpoint.keep_last=5", "output_root=other"]
     )
-    def test_what_does_not_change_the_training_is_free(self, override):
+    def test_settings_that_do_not_affect_the_training_may_change(self, override):
         run = make_run("outputs/a/1")
         key, _, value = override.partition("=")
         assert (
@@ -180,7 +180,7 @@ class TestResumingAFolder:
         run = make_run("outputs/a/1", "algo=v1", "algo.sub.tau=0.5")
         assert plan_for(f"resume={run}", "algo=v1").config.algo["sub"]["tau"] == 0.5
 
-    def test_another_one_is_refused(self):
+    def test_another_group_than_the_runs_is_refused(self):
         run = make_run("outputs/a/1", "algo=v1")
         with pytest.raises(
             SettingsError, match=r"(?s)algo\.recurrent: true -> false|algo\._target_: .*make_hdrqn -> .*make_drqn"
@@ -189,7 +189,7 @@ class TestResumingAFolder:
         with pytest.raises(SettingsError, match="experiment=as_in_paper can't be given with resume=FOLDER"):
             plan_for(f"resume={run}", "experiment=as_in_paper")
 
-    def test_a_run_whose_origin_is_unknown_is_resumed_as_well(self):
+    def test_a_run_without_a_recorded_origin_can_be_resumed(self):
         run = make_run("outputs/a/1", "seed=3", "algo=v1")
         (run / "run.json").unlink()
         found = plan_for(f"resume={run}")
@@ -197,7 +197,7 @@ class TestResumingAFolder:
         with pytest.raises(SettingsError, match="seed: 3 -> 4"):
             plan_for(f"resume={run}", "seed=4")
 
-    def test_one_of_its_checkpoints_can_be_named(self):
+    def test_a_checkpoint_of_the_run_can_be_named(self):
         run = make_run("outputs/a/1")
         path = run / "checkpoints" / "checkpoint-000000000100"
         found = plan_for(f"resume={path}")
@@ -208,18 +208,18 @@ class TestResumingAFolder:
         )
 
     @pytest.mark.parametrize("folder", ["nowhere", "outputs"])
-    def test_what_is_no_run_is_refused(self, folder):
+    def test_a_folder_that_is_not_a_run_is_refused(self, folder):
         with pytest.raises(SettingsError, match=rf"^run must be the folder of a training, got {folder}, which has no"):
             plan_for(f"resume={folder}")
 
-    def test_a_wrong_value_is_told(self):
+    def test_a_wrong_value_is_reported(self):
         run = make_run("outputs/a/1")
         with pytest.raises(SettingsError, match=r"checkpoint\.keep_last must be >= 2, got 1"):
             plan_for(f"resume={run}", "checkpoint.keep_last=1")
 
 
 class TestResumingTheSameCommand:
-    def test_there_is_none_yet(self):
+    def test_the_same_command_starts_a_new_run_if_there_is_none_yet(self):
         found = plan_for("resume=auto")
         assert (found.folder, found.resumed) == (Path("outputs/gridworld-v2/new"), False)
 
@@ -231,24 +231,24 @@ class TestResumingTheSameCommand:
         found = plan_for("resume=auto", *SMALL, "seed=1")
         assert found.folder == Path("outputs/a/2") and found.resumed and found.checkpoint is None
 
-    def test_fewer_frames_before_are_no_other_setting_but_more_are(self):
+    def test_a_run_of_fewer_frames_is_resumed_but_not_one_of_more(self):
         run = make_run("outputs/a/1", "total_frames=1000")
         assert plan_for("resume=auto", *SMALL, "total_frames=2000").folder == run
         assert plan_for("resume=auto", *SMALL, "total_frames=500").folder != run
 
-    def test_runs_that_can_not_be_read_are_passed_over(self):
+    def test_unreadable_runs_are_skipped(self):
         run = make_run("outputs/a/1")
         for name, text in (("2", "env: ["), ("3", "seed: 1"), ("4", HOSTILE["tag"]())):
             Path(f"outputs/a/{name}").mkdir()
             Path(f"outputs/a/{name}/config.yaml").write_text(text)
         assert plan_for("resume=auto", *SMALL).folder == run
 
-    def test_output_root_says_where_to_look(self):
+    def test_earlier_runs_are_looked_for_in_output_root(self):
         run = make_run("elsewhere/a/1", "output_root=elsewhere")
         assert plan_for("resume=auto", *SMALL).folder != run
         assert plan_for("resume=auto", *SMALL, "output_root=elsewhere").folder == run
 
-    def test_a_given_folder_is_the_only_one_that_counts(self):
+    def test_only_a_given_folder_is_considered(self):
         other, mine = make_run("outputs/a/1"), Path("mine")
         command = ["resume=auto", *SMALL, "hydra.run.dir=mine"]
         assert plan_for(*command, folder=mine).folder == mine
@@ -263,7 +263,7 @@ class TestResumingTheSameCommand:
 
 
 class TestDatabases:
-    """A run folder may not send what a training measures anywhere."""
+    """A run folder must not decide where measurements are sent."""
 
     def named(self, place):
         run = make_run("outputs/a/1", "logger=mlflow")
@@ -272,13 +272,13 @@ class TestDatabases:
         return run
 
     @pytest.mark.parametrize("place", ["http://elsewhere:5000", "sqlite:////home/mine.db", "sqlite:///../mlflow.db"])
-    def test_one_that_the_command_does_not_know_is_refused(self, place):
+    def test_a_database_that_the_command_does_not_name_is_refused(self, place):
         run = self.named(place)
         with pytest.raises(SettingsError, match=re.escape(f"got {place!r}, which stands in the run folder")):
             plan_for(f"resume={run}")
         assert plan_for(f"resume={run}", f"allowed_targets=['{place}']").resumed
 
-    def test_the_usual_one_is_not(self):
+    def test_the_default_database_is_accepted(self):
         assert plan_for(f"resume={self.named('sqlite:///outputs/mlflow.db')}").resumed
 
 
@@ -300,7 +300,7 @@ class TestHostileRunFolders:
             assert len(str(refusal.value)) > 20 and str(refusal.value).count("\n") < 3
         assert not (tmp_path / "marker").exists()
 
-    def test_only_the_command_can_allow_more(self, tmp_path):
+    def test_only_the_command_can_allow_more_builders(self, tmp_path):
         (tmp_path / "run").mkdir()
         (tmp_path / "run" / "config.yaml").write_text(HOSTILE["allowed by itself"]())
         with pytest.raises(SettingsError, match=r"add 'allowed_targets=\[os\.makedirs\]' to the command"):
@@ -308,13 +308,13 @@ class TestHostileRunFolders:
         found = plan_for("resume=run", "allowed_targets=[os.makedirs]")
         assert found.config.allowed_targets == ["os.makedirs"]
 
-    def test_nor_can_a_run_override_differences_by_itself(self):
+    def test_a_run_folder_can_not_set_resume_override(self):
         run = make_run("outputs/a/1", "resume_override=true", "seed=1")
         with pytest.raises(SettingsError, match="seed: 1 -> 2"):
             plan_for(f"resume={run}", "seed=2")
 
     @pytest.mark.parametrize("content", ["", "[]", '{"choices": 3}', '{"choices": {"seed": "2"}}', "\x00"])
-    def test_an_origin_that_lies_changes_nothing(self, content):
+    def test_a_false_origin_changes_no_settings(self, content):
         run = make_run("outputs/a/1", "seed=1")
         (run / "run.json").write_text(content)
         if "seed" not in content:
@@ -353,12 +353,12 @@ class TestDifferences:
             ({"logger": {"loggers": []}}, {"logger": {"loggers": [1]}}, ["logger.loggers: [] -> [1]"]),
         ],
     )
-    def test_each_is_a_line(self, before, after, found):
+    def test_each_difference_is_a_line(self, before, after, found):
         assert self.compare(before, after) == found
 
 
 class TestRecord:
-    def test_a_run_says_where_it_comes_from(self, monkeypatch):
+    def test_a_run_records_its_origin(self, monkeypatch):
         monkeypatch.setattr("sys.argv", ["train.py", "seed=3"])
         run = make_run("outputs/a/1", "seed=3")
         origin = json.loads((run / "run.json").read_text())
@@ -373,7 +373,7 @@ class TestRecord:
         assert "seed: 3" in text and "${" not in text and "learning_rate_frames: 800000" in text
         assert {path.name for path in run.iterdir()} == {"config.yaml", "run.json"}
 
-    def test_its_origin_stays_when_it_is_resumed_and_its_settings_are_the_new_ones(self):
+    def test_a_resumed_run_keeps_its_origin_and_records_the_new_settings(self):
         run = make_run("outputs/a/1", "total_frames=100")
         origin = (run / "run.json").read_text()
         record(plan_for(f"resume={run}", "total_frames=200"))
@@ -382,6 +382,6 @@ class TestRecord:
         record(plan_for(f"resume={run}"))
         assert OmegaConf.load(run / "config.yaml").total_frames == 200
 
-    def test_without_git_there_is_no_commit(self, monkeypatch):
+    def test_without_git_no_commit_is_recorded(self, monkeypatch):
         monkeypatch.setenv("PATH", "")
         assert resuming._commit() is None

@@ -1,4 +1,4 @@
-"""Real sweeps, and the callback that keeps their books."""
+"""Real sweeps, and the callback that keeps their ledger."""
 
 import csv
 import json
@@ -31,7 +31,7 @@ def finished(folder):
 
 
 def rows_of(folder, job):
-    """What a job logged, except what its speed decides."""
+    """The rows that a job logged, without the columns that depend on its speed."""
     path = next((folder / "sweep").glob(f"{job}-*")) / "metrics.csv"
     with path.open(newline="") as file:
         return [
@@ -42,7 +42,7 @@ def rows_of(folder, job):
 
 @pytest.fixture(scope="module")
 def parallel(tmp_path_factory):
-    """Two workers and six jobs, every other of which fails."""
+    """Two workers and six jobs, every second of which fails."""
     folder = tmp_path_factory.mktemp("parallel")
     arguments = ["-m", "sweep=parallel", "hydra.launcher.n_jobs=2", "seed=5,6,5", "algo.gamma=0.9,7"]
     return folder, sweep(folder, *arguments)
@@ -54,7 +54,7 @@ def test_failed_jobs_do_not_end_a_parallel_sweep(parallel):
     assert done.returncode == 1
 
 
-def test_the_list_of_failed_jobs_is_the_last_thing_to_be_seen(parallel):
+def test_the_list_of_failed_jobs_comes_last(parallel):
     _, done = parallel
     assert done.stderr.partition("\nunfinished: ")[2].splitlines() == [
         "3 of 6 started jobs in sweep",
@@ -149,7 +149,7 @@ def test_a_killed_parallel_sweep_leaves_saved_jobs_and_the_same_command_goes_on(
 
 
 @pytest.mark.slow
-def test_a_stopped_serial_sweep_ends(tmp_path):
+def test_a_stopped_serial_sweep_starts_no_more_jobs(tmp_path):
     command = [sys.executable, str(ROOT / "train.py"), "-m", *COMMON, "seed=0,1", "total_frames=100000000"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
     try:
@@ -219,7 +219,7 @@ class TestCallback:
         callback.on_multirun_start(job_config(tmp_path))
         return callback
 
-    def test_the_book_of_an_earlier_sweep_in_the_same_folder_is_closed(self, callback, tmp_path):
+    def test_the_ledger_of_an_earlier_sweep_in_the_same_folder_is_replaced(self, callback, tmp_path):
         callback.on_job_start(job_config(tmp_path))
         callback.on_multirun_start(job_config(tmp_path))
         assert sweeps.read_ledger(callback.ledger) == []
@@ -230,7 +230,7 @@ class TestCallback:
         callback.on_job_end(job_config(tmp_path), result)
         assert result.status == JobStatus.FAILED and list(tmp_path.iterdir()) == []
 
-    def test_done_jobs_end_well(self, callback, tmp_path):
+    def test_a_sweep_whose_jobs_are_done_does_not_exit_with_an_error(self, callback, tmp_path):
         result = job_return(1.5)
         callback.on_job_start(job_config(tmp_path))
         callback.on_job_end(job_config(tmp_path), result)
@@ -248,7 +248,7 @@ class TestCallback:
             callback.on_multirun_end(job_config(tmp_path))
         assert stop.value.code == 1
 
-    def test_a_search_learns_of_the_failure(self, callback, tmp_path):
+    def test_a_search_sees_a_failed_job(self, callback, tmp_path):
         result = job_return(Unpicklable("out of memory"))
         callback.on_job_end(job_config(tmp_path, sweeper="hydra_plugins.optuna.OptunaSweeper"), result)
         assert result.status == JobStatus.FAILED
@@ -325,7 +325,7 @@ class TestStop:
         assert told == ["sleep", "sleep", signal.SIGTERM, *["sleep"] * saving_polls, 143]
         assert stop.orphaned
 
-    def test_an_orphan_leaves_the_book_to_the_sweep_that_was_begun_since(self, tmp_path, monkeypatch):
+    def test_an_orphan_leaves_the_ledger_to_the_sweep_that_was_started_since(self, tmp_path, monkeypatch):
         monkeypatch.setattr(sweeps.atexit, "register", lambda *_: None)
         callback = sweeps.Sweep()
         callback.on_multirun_start(job_config(tmp_path))
@@ -333,7 +333,7 @@ class TestStop:
         callback.on_job_end(job_config(tmp_path), job_return(RuntimeError("stopped")))
         assert sweeps.read_ledger(callback.ledger) == []
 
-    def test_in_the_main_process_it_ends_the_program(self):
+    def test_a_stopped_job_in_the_main_process_ends_the_program(self):
         with pytest.raises(SystemExit) as stop:
             sweeps.end_stopped_job(130)
         assert stop.value.code == 130

@@ -81,7 +81,7 @@ class TestTree:
         loggers = [build(each, tmp_path, place="logger.loggers[0]") for each in settings]
         assert all(hasattr(each, "log_scalar") for each in loggers)
 
-    def test_the_levels_are_configured_apart(self):
+    def test_the_levels_are_configured_separately(self):
         config = configure("algo=v2", "algo.sub.slice_len=3", "algo.meta.slice_len=2", "algo.sub_exploration.end=0.3")
         _, algorithm = build_algorithm(resolved(config), {"num_envs": 2})
         assert [learner.settings.slice_len for learner in algorithm.learners.values()] == [3, 2]
@@ -98,7 +98,7 @@ class TestTree:
 
 
 class TestMessages:
-    """Wrong settings are told by their full names before anything is trained."""
+    """Wrong settings are reported by their full names before anything is trained."""
 
     @pytest.fixture
     def run(self, tmp_path, monkeypatch, capsys):
@@ -134,7 +134,7 @@ class TestMessages:
             ("device=tpu", ("device must be auto, cpu or cuda", "'tpu'")),
         ],
     )
-    def test_a_wrong_value_is_told_with_its_rule(self, run, argument, parts):
+    def test_a_wrong_value_is_reported_with_its_rule(self, run, argument, parts):
         message = run(argument)
         for part in parts:
             assert part in message, message
@@ -236,7 +236,7 @@ def stop(process, number):
 
 class TestStoppingAndResuming:
     def test_a_run_that_was_stopped_twice_is_the_same_as_one_that_was_not(self, tmp_path):
-        """By SIGTERM and by Ctrl-C; gone on with by ``resume=FOLDER`` and by the same command with ``resume=auto``."""
+        """By SIGTERM and by Ctrl-C; resumed by ``resume=FOLDER`` and by the same command with ``resume=auto``."""
         plain, same = tmp_path / "plain", tmp_path / "same"
         for folder in (plain, same):
             folder.mkdir()
@@ -287,7 +287,7 @@ def finished(tmp_path_factory):
 
 @pytest.fixture
 def a_run(finished, tmp_path):
-    """A copy of it to work on."""
+    """A copy of the finished run to work on."""
     return shutil.copytree(finished, tmp_path / "a") / "run"
 
 
@@ -297,21 +297,21 @@ def snapshot(folder):
 
 
 class TestGoingOnWithAFinishedRun:
-    def test_for_more_frames(self, a_run):
+    def test_a_finished_run_can_go_on_for_more_frames(self, a_run):
         process = start_script(a_run.parent, "resume=run", "total_frames=4096")
         wait_for_row(a_run.parent, 1280, process)
         assert not (a_run / "summary.json").exists() and not (a_run / "curves.png").exists()  # it is unfinished again
         assert stop(process, signal.SIGTERM) == 143
         assert OmegaConf.load(a_run / "config.yaml").total_frames == 4096
 
-    def test_when_nothing_is_left_to_do(self, a_run):
+    def test_resuming_a_finished_run_trains_no_more(self, a_run):
         rows, before = table(a_run), snapshot(a_run / "checkpoints")
         code, _, told = run_script(a_run.parent, "resume=run")
         assert code == 0, told
         assert table(a_run) == rows and snapshot(a_run / "checkpoints") == before
         check_run_folder(a_run, frames=1_024)
 
-    def test_from_an_older_checkpoint(self, a_run, finished):
+    def test_a_finished_run_can_go_on_from_an_older_checkpoint(self, a_run, finished):
         code, _, told = run_script(
             a_run.parent, "resume=run/checkpoints/checkpoint-000000000512", "resume_override=true"
         )
@@ -327,7 +327,7 @@ class TestBeginningWithOtherWeights:
     def weights(self, path):
         return load_file(next(path.glob("components/*-policy")) / "tensors.safetensors")
 
-    def test_of_a_run_on_another_task(self, a_run):
+    def test_a_run_can_begin_with_the_weights_of_one_on_another_task(self, a_run):
         slow = ["total_frames=512", "algo.sub.learning_rate=1e-12", "algo.meta.learning_rate=1e-12"]
         slow += ["algo.sub.learning_rate_end=null", "algo.meta.learning_rate_end=null"]
         code, _, told = self.begin(a_run.parent, "init_from=run", "init_checkpoint=last", *slow)
@@ -343,7 +343,7 @@ class TestBeginningWithOtherWeights:
         code, _, told = run_script(a_run.parent, "resume=new", "total_frames=640")
         assert code == 0, told
 
-    def test_that_do_not_fit(self, a_run):
+    def test_initial_weights_that_do_not_fit_are_refused(self, a_run):
         code, _, told = self.begin(a_run.parent, "init_from=run", "env.view=3")
         assert code == 1 and "Traceback" not in told
         assert "error: init_from must hold the weights of an agent with the same networks, got others: " in told
@@ -357,19 +357,19 @@ class TestWhatIsLeftAlone:
         assert code == 1 and "Traceback" not in told and printed == ""
         return told.strip().splitlines()
 
-    def test_a_new_run_in_its_folder(self, a_run):
+    def test_a_new_run_in_the_folder_of_another_is_refused(self, a_run):
         before = snapshot(a_run)
         told = self.refused(a_run.parent, *SHORT, "hydra.run.dir=run")
         assert told[-1].startswith("error: ") and "already holds a run, which would be overwritten" in told[-1]
         assert snapshot(a_run) == before
 
-    def test_what_was_saved_after_the_checkpoint_it_shall_go_on_from(self, a_run):
+    def test_resuming_an_older_checkpoint_is_refused_while_there_are_newer_ones(self, a_run):
         before = snapshot(a_run)
         told = self.refused(a_run.parent, "resume=run/checkpoints/checkpoint-000000000512")
         assert "must name a run's newest checkpoint" in told[-1] and "resume_override=true" in told[-1]
         assert snapshot(a_run) == before
 
-    def test_other_settings(self, a_run):
+    def test_resuming_with_other_settings_is_refused(self, a_run):
         before = snapshot(a_run)
         told = self.refused(a_run.parent, "resume=run", "seed=5", "algo.sub.tau=0.5")
         assert told[-4:-1] == [
@@ -386,13 +386,13 @@ class TestWhatIsLeftAlone:
             ("env.view=4", "env.view must be an odd number"),
         ],
     )
-    def test_other_settings_on_purpose_that_do_not_fit(self, a_run, change, message):
+    def test_settings_that_do_not_fit_are_refused_in_spite_of_resume_override(self, a_run, change, message):
         before = snapshot(a_run)
         told = self.refused(a_run.parent, "resume=run", change, "resume_override=true")
         assert any(line.startswith("error: ") and message in line for line in told)
         assert snapshot(a_run) == before  # no error.txt either: the run has not failed
 
-    def test_one_that_is_being_trained(self, a_run):
+    def test_a_run_that_is_being_trained_is_left_alone(self, a_run):
         before = snapshot(a_run)
         with locked(a_run):
             told = self.refused(a_run.parent, "resume=run")
@@ -404,7 +404,7 @@ class TestWhatIsLeftAlone:
             assert "new is in use" in told[-1] and [path.name for path in empty.iterdir()] == [".lock"]
         assert snapshot(a_run) == before
 
-    def test_one_whose_checkpoints_are_all_damaged(self, a_run):
+    def test_a_run_whose_checkpoints_are_all_damaged_is_left_alone(self, a_run):
         for manifest in a_run.rglob("manifest.json"):
             manifest.write_text("{}")
         before = snapshot(a_run)
@@ -413,7 +413,7 @@ class TestWhatIsLeftAlone:
         assert "error: no checkpoint in" in told[-1] and "can be loaded; remove that folder to start" in told[-1]
         assert snapshot(a_run) == before
 
-    def test_one_that_means_harm(self, a_run):
+    def test_a_malicious_run_is_left_alone(self, a_run):
         text = (a_run / "config.yaml").read_text()
         (a_run / "config.yaml").write_text(text.replace("hdrqn_torchrl.modules.compact_network", "os.makedirs"))
         before = snapshot(a_run)
@@ -453,7 +453,7 @@ class TestFailures:
         check_same_checkpoint(a_run, finished / "run")
         assert table(a_run) == table(finished / "run")
 
-    def test_a_kill_between_the_two_renames_of_a_replaced_checkpoint(self, a_run):
+    def test_a_kill_between_the_two_renames_of_a_replaced_checkpoint_loses_nothing(self, a_run):
         """Its only checkpoint has no name at that moment; it must not start from scratch."""
         only = a_run / "checkpoints" / "checkpoint-000000001024"
         for path in only.parent.iterdir():
@@ -467,7 +467,7 @@ class TestFailures:
         assert list(only.parent.iterdir()) == [only] and table(a_run) == rows
         assert only.stat().st_ino == inode  # it was not written again
 
-    def test_a_full_disk(self, a_run):
+    def test_a_full_disk_ends_the_training_with_a_message(self, a_run):
         good = a_run / "checkpoints" / "checkpoint-000000001024"
         command, limit = ["resume=run", "total_frames=2048"], partial(limit_file_size, 40_000)
         code, printed, told = run_script(a_run.parent, *command, prepare=limit)
@@ -478,13 +478,13 @@ class TestFailures:
         assert "CheckpointError" in (a_run / "error.txt").read_text() and leftovers(a_run) == 0
         verify(good)
 
-    def test_a_full_disk_when_a_row_of_metrics_is_written(self, a_run):
+    def test_a_full_disk_while_writing_metrics_ends_the_training_with_a_message(self, a_run):
         code, _, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=fill_disk_at_next_row)
         assert code == 1 and "Traceback" not in told
         line = told.strip().splitlines()[-1]
         assert "File too large" in line and "train.py resume=run` goes on from the last checkpoint" in line
 
-    def test_a_number_that_is_none(self, a_run):
+    def test_a_nan_ends_the_training_with_a_message(self, a_run):
         code, printed, told = run_script(a_run.parent, "resume=run", "total_frames=2048", prepare=poison_updates)
         assert (code, printed) == (1, "") and "Traceback" not in told
         line = told.strip().splitlines()[-1]
@@ -494,7 +494,7 @@ class TestFailures:
         assert "the last good checkpoint is " in line and "checkpoint-000000001024" in line
         assert "NonFiniteError" in (a_run / "error.txt").read_text()
 
-    def test_a_folder_that_can_not_be_made(self, tmp_path):
+    def test_a_run_folder_that_can_not_be_made_is_reported(self, tmp_path):
         (tmp_path / "file").write_text("")
         code, _, told = run_script(tmp_path, *SHORT, "hydra.run.dir=file/run")
         assert code == 1 and "Not a directory" in told and "file/run" in told

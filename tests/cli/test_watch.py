@@ -107,20 +107,20 @@ def test_frames_are_those_of_the_loaded_weights(run, tmp_path, command, monkeypa
     assert [frame.score for frame in kept] == [frame.score for frame in expected]
 
 
-def test_mp4_in_a_new_folder(run, command):
+def test_an_mp4_is_written_to_a_new_folder(run, command):
     pytest.importorskip("av")
     command(f"run={run}", "out=new/folder/episode.MP4", "episodes=1")
     assert Path("new/folder/episode.MP4").read_bytes()[4:8] == b"ftyp"
 
 
-def test_terminal(run, command):
+def test_episodes_can_be_shown_in_the_terminal(run, command):
     printed = command(f"run={run}", "out=terminal", "episodes=1")
     assert [printed.count(f"step {step} of 4") for step in range(6)] == [1, 1, 1, 1, 1, 0]
     assert "wants goal" in printed and "time is up" in printed
     assert not list(Path().iterdir())
 
 
-def test_stopping_to_watch_is_no_error(run, command, monkeypatch):
+def test_interrupting_the_show_is_not_an_error(run, command, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
@@ -148,7 +148,7 @@ def test_wrong_settings_are_explained_and_write_nothing(run, command, arguments,
     assert not list(Path().iterdir())
 
 
-def test_a_place_that_can_not_be_written_is_found_before_playing(run, command, monkeypatch):
+def test_an_unwritable_place_is_found_before_playing(run, command, monkeypatch):
     monkeypatch.setattr(watch, "record", lambda settings: pytest.fail("played first"))
     Path("file").touch()
     assert "error: out must be a file that can be written, got 'file/episode.gif'" in error(
@@ -181,7 +181,7 @@ def test_builders_of_other_packages_are_not_trusted(run, tmp_path, command):
     assert "got 'helpers.small_env'" in error(command, f"run={folder}")
 
 
-def test_help_answers_without_torch():
+def test_help_does_not_load_torch():
     code = (
         "import runpy, sys; sys.argv = ['watch.py', '--help']\n"
         "try: runpy.run_path('watch.py', run_name='__main__')\n"

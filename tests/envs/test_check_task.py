@@ -1,4 +1,4 @@
-"""Environments with one fault each are told of it; the project's own have none."""
+"""Environments with one fault each are reported with it; the project's own have none."""
 
 import re
 from dataclasses import replace
@@ -142,7 +142,7 @@ def test_a_whole_task_without_players_and_picture_does_without_a_ceiling_line():
         (corridor(pays=-1.0), r"the sum of 'extrinsic_reward' must lie in \[0, 6\]"),
         (corridor(Random), "the same seed must give the same worlds"),
         (corridor(Deaf), "another seed must give other worlds"),
-        (corridor(Forgetful), r"state_dict\(\) must hold all there is"),
+        (corridor(Forgetful), r"state_dict\(\) must hold the whole state"),
         (Corridor(None, task=WHOLE), r"the batch size must be \[N\]"),
         (corridor(odd={"action": Unbounded((4, 1))}), "'action' must be one number"),
     ],
@@ -156,9 +156,9 @@ def test_a_fault_is_found_and_named(env, fault):
 @pytest.mark.parametrize(
     "env, costs",
     [
-        (corridor(Stateless), "no resume: a training that was stopped begins anew"),
+        (corridor(Stateless), "no resume: a training that was stopped starts from scratch"),
         (Corridor(4, task=WHOLE), "no success rate"),
-        (Corridor(4, task=WHOLE), "no penalty for what is to be avoided"),
+        (Corridor(4, task=WHOLE), "no penalty for hazards"),
         (Corridor(4, without=("attained", "hazard", "success")), "agents of one level only"),
         (Corridor(4, task=WHOLE, without=("extrinsic_reward",)), "agents of one level only"),
         (Corridor(4), "targets are not bounded"),

@@ -715,7 +715,7 @@ class TestSeparateParts:
 
     @pytest.mark.parametrize("separate", [{"network.haed": 1.0}, {"network.head": 0.0}], ids=str)
     def test_wrong_values(self, separate):
-        with pytest.raises(ValueError, match="separate must map beginnings of parameters' names to shares > 0"):
+        with pytest.raises(ValueError, match="separate must map prefixes of parameters' names to shares > 0"):
             make_learner(separate=separate)
 
 

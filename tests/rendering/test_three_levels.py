@@ -144,5 +144,5 @@ def test_a_task_without_a_scene_shows_what_the_agent_sees():
 def test_an_agent_that_tells_no_levels_is_refused():
     env = MultiGoalGridEnv(1)
     agent = Algorithm(policy=Scripted(), learners={}, explorations={}, make_transforms=copies_of(SubgoalTransform(2)))
-    with pytest.raises(ValueError, match="algorithm must tell its levels to be watched, got none; "):
+    with pytest.raises(ValueError, match="algorithm must name its levels to be watched, got none; "):
         record_episodes(agent.transform(env), agent)

@@ -1,4 +1,4 @@
-"""Trained agents read back, from run folders that mean well or harm."""
+"""Trained agents loaded from run folders, honest or hostile."""
 
 import subprocess
 import sys
@@ -49,52 +49,52 @@ def test_neither_hydra_nor_omegaconf_is_needed(run):
 
 
 class TestLoadAgent:
-    def test_the_agent_plays_its_task(self, run):
+    def test_a_loaded_agent_plays_its_task(self, run):
         agent = load_agent(run, num_envs=3)
         rollout = agent.env.rollout(5, agent.algorithm.policy, break_when_any_done=False)
         assert rollout.shape == (3, 5) and agent.config.env["view"] == 3 and rollout["observation"].shape[2:] == (3, 3)
 
     @pytest.mark.parametrize(("checkpoint", "step"), [("best", 100), ("last", 200)])
-    def test_its_weights_are_the_best_or_the_last(self, run, checkpoint, step):
+    def test_an_agent_has_the_best_or_the_last_weights(self, run, checkpoint, step):
         assert step_of(load_agent(run, checkpoint=checkpoint)) == step
 
-    def test_or_those_of_a_path(self, run):
+    def test_an_agent_has_the_weights_of_a_path(self, run):
         assert step_of(load_agent(run)) == 100
         assert step_of(load_agent(str(run), checkpoint=str(run / "checkpoints" / "checkpoint-000000000200"))) == 200
         assert step_of(load_agent(run, checkpoint=str(run / "weights.safetensors"))) == 200
 
-    def test_its_task_can_be_changed(self, run):
+    def test_the_task_of_an_agent_can_be_changed(self, run):
         agent = load_agent(run, env_changes={"layout": "four_rooms", "max_steps": 3})
         assert agent.env.base_env.max_steps == 3 and agent.config.env["layout"] == "four_rooms"
 
     @pytest.mark.parametrize("key", ["veiw", "_target_", "_partial_"])
-    def test_but_not_by_what_is_no_setting_of_it(self, run, key):
-        with pytest.raises(SettingsError, match=rf"env\.{key} must be one of \['layout', .*\]; it is none"):
+    def test_a_change_of_an_unknown_setting_is_refused(self, run, key):
+        with pytest.raises(SettingsError, match=rf"env\.KEY must be one of \['layout', .*\], got {key}\."):
             load_agent(run, env_changes={key: 3})
 
-    def test_a_change_that_its_weights_do_not_fit(self, run):
+    def test_a_change_that_the_weights_do_not_fit_is_refused(self, run):
         with pytest.raises(
             SettingsError,
-            match=r"env.num_goals=3 must leave what the agent sees and does as its networks were made for, but",
+            match=r"env.num_goals=3 must not change what the agent's networks see or choose from, but",
         ):
             load_agent(run, env_changes={"num_goals": 3})
 
-    def test_a_change_that_breaks_a_rule(self, run):
+    def test_a_change_that_breaks_a_rule_is_refused(self, run):
         with pytest.raises(SettingsError, match=r"^env\.max_steps must be >= 1, got 0; "):
             load_agent(run, env_changes={"max_steps": 0})
 
-    def test_what_is_no_run(self, run, tmp_path):
+    def test_a_folder_that_is_not_a_run_is_refused(self, run, tmp_path):
         for folder in (tmp_path, tmp_path / "nothing", run / "config.yaml"):
             with pytest.raises(SettingsError, match=r"^run must be the folder of a training, got .* no config\.yaml; "):
                 load_agent(folder)
 
-    def test_a_run_that_has_saved_nothing(self, tmp_path):
+    def test_a_run_without_checkpoints_is_refused(self, tmp_path):
         write_run(tmp_path, weights=False)
         with pytest.raises(SettingsError, match=r"checkpoint=best is not in .*: the run has not saved anything yet"):
             load_agent(tmp_path)
 
     @pytest.mark.parametrize("checkpoint", ["best", "last"])
-    def test_a_run_whose_checkpoints_are_all_damaged(self, tmp_path, checkpoint):
+    def test_a_run_whose_checkpoints_are_all_damaged_is_refused(self, tmp_path, checkpoint):
         write_run(tmp_path)
         for manifest in tmp_path.rglob("manifest.json"):
             manifest.write_text("[]")
@@ -104,7 +104,7 @@ class TestLoadAgent:
         ):
             load_agent(tmp_path, checkpoint=checkpoint)
 
-    def test_checkpoints_that_are_no_folder(self, tmp_path):
+    def test_a_file_in_place_of_the_checkpoints_is_refused(self, tmp_path):
         write_run(tmp_path, weights=False)
         (tmp_path / "checkpoints").write_text("")
         with pytest.raises(SettingsError, match="checkpoints must be what a run leaves there, got a file;"):
@@ -127,7 +127,7 @@ def hostile_run(tmp_path, monkeypatch):
 
 
 class TestHostileRunFolders:
-    def test_what_is_checked_is_what_is_built(self, hostile_run):
+    def test_the_data_that_is_checked_is_the_data_that_is_built(self, hostile_run):
         """Hydra follows references when it builds: this name is harmless before the device is set, and not after."""
         config = OmegaConf.create(HOSTILE["name that changes with the device"]())
         config.env.name = str(hostile_run(changed()) / "marker")
@@ -140,8 +140,8 @@ class TestHostileRunFolders:
         with pytest.raises(SettingsError, match="unexpected keyword argument 't'"):
             build_algorithm(harmless, {"device": "cpu"})
 
-    def test_the_trap_works(self, tmp_path, monkeypatch):
-        """Without the check it would be executed."""
+    def test_the_hostile_folder_would_run_code_without_the_check(self, tmp_path, monkeypatch):
+        """So that the other tests prove something."""
         monkeypatch.setattr(building, "check_targets", lambda *_: None)
         kinds = ("a part of a part", "in place of a number", "through a module of the package")
         for number, kind in enumerate([*kinds, "allowed by itself, in part"]):
@@ -157,7 +157,7 @@ class TestHostileRunFolders:
             load_agent(run)
         assert len(str(refusal.value)) > 20 and str(refusal.value).count("\n") < 3
 
-    def test_allowed_by_the_caller_it_is_built(self, hostile_run):
+    def test_a_builder_that_the_caller_allows_is_called(self, hostile_run):
         run = hostile_run(changed(network={"_target_": "hdrqn_torchrl.modules.Architecture"}))
         with pytest.raises(SettingsError, match=r"allowed_targets=\[hdrqn_torchrl\.modules\.Architecture\]"):
             load_agent(run)

@@ -27,19 +27,19 @@ NET = {"_target_": "hdrqn_torchrl.modules.compact_network"}
     ],
     ids=lambda value: str(value)[:60],
 )
-def test_a_size_beyond_all_measure_is_told_with_its_rule(settings, told):
+def test_an_unreasonable_size_is_reported_with_its_rule(settings, told):
     with pytest.raises(SettingsError, match=f"^part\\.{told}") as refusal:
         check_sizes(settings, "part")
     assert str(refusal.value).endswith(".") and "\n" not in str(refusal.value)
 
 
-def test_types_are_checked_as_well():
+def test_build_checks_types():
     with pytest.raises(ValueError, match=r"^env\.view must be an integer or null, got 'abc'; "):
         build(GRID | {"view": "abc"}, place="env")
 
 
 @pytest.mark.parametrize("place", ["env", "network", "algo", "logger.loggers[0]"])
-def test_a_builder_stands_in_its_own_place_only(place):
+def test_a_builder_is_allowed_only_in_its_own_place(place):
     elsewhere = [
         target for name, targets in BUILDERS.items() if name.partition("[")[0] not in place for target in targets
     ]
@@ -49,50 +49,50 @@ def test_a_builder_stands_in_its_own_place_only(place):
 
 
 @pytest.mark.parametrize("settings", [None, 3, [], {}, {"num_envs": 3}, [GRID]], ids=str)
-def test_nothing_is_built_without_a_name(settings):
+def test_settings_without_a_target_are_refused(settings):
     with pytest.raises(SettingsError, match=r"^env must be settings with a _target_, got "):
         build(settings, place="env")
 
 
-def test_an_environment():
+def test_an_environment_is_built_from_its_settings():
     assert build(GRID | {"num_envs": 3, "view": None}, place="env").num_envs == 3
 
 
 class TestMessages:
-    def test_a_broken_rule_has_the_full_name_of_the_setting_in_front(self):
+    def test_a_broken_rule_is_reported_with_the_full_name_of_the_setting(self):
         with pytest.raises(SettingsError, match=r"^env\.view must be an odd number .* got 4; "):
             build(GRID | {"view": 4}, place="env")
 
-    def test_of_a_part_too(self):
+    def test_a_broken_rule_of_a_nested_part_is_reported_with_its_full_name(self):
         from helpers import compact_network, small_env
 
         settings = V2 | {"sub": LEARNER | {"batch_size": 0}}
         with pytest.raises(SettingsError, match=r"^algo\.sub\.batch_size must be >= 1, got 0; "):
             build(settings, small_env(2), compact_network(), place="algo")
 
-    def test_an_unknown_setting_is_told_with_what_shows_the_known_ones(self):
+    def test_an_unknown_setting_is_reported_with_the_command_that_lists_the_known_ones(self):
         with pytest.raises(SettingsError, match=r"^env: .*'veiw'; `python train\.py --cfg job` "):
             build(GRID | {"veiw": 4}, place="env")
 
-    def test_what_the_machine_can_not_do_is_no_wrong_setting(self, tmp_path):
+    def test_an_error_of_the_machine_is_not_blamed_on_a_setting(self, tmp_path):
         (tmp_path / "file").write_text("")
         settings = {"_target_": "os.makedirs", "name": str(tmp_path / "file" / "folder")}
         with pytest.raises(SettingsError, match=r"^\[Errno \d+\] Not a directory: "):
             build(settings, place="env", allowed=["os.makedirs"])
 
     @pytest.mark.parametrize("target", ["no_such_package.Env", "hdrqn_torchrl.envs.NoSuchEnv", "hdrqn_torchrl.envs"])
-    def test_a_target_that_is_nothing_to_call(self, target):
+    def test_a_target_that_can_not_be_called_is_refused(self, target):
         with pytest.raises(SettingsError, match=rf"^_target_ must name a function or class, got '{target}'"):
             build({"_target_": target}, place="env", allowed=[target])
 
 
-def test_what_a_logger_only_shows_is_not_built():
+def test_settings_that_a_logger_only_shows_are_not_built():
     settings = {"_target_": "builtins.dict", "settings": {"env": dict(GRID)}, "_recursive_": False, "_convert_": "all"}
     found = build(settings, place="logger.loggers[0]", allowed=["builtins.dict"])
     assert found == {"settings": {"env": GRID}} and found["settings"] is not settings["settings"]
 
 
 @pytest.mark.parametrize("mark", [{"_partial_": True}, {"_args_": [3]}, {"_recursive_": True}], ids=str)
-def test_no_other_mark_of_hydra_is_followed(mark):
+def test_other_special_keys_of_hydra_are_refused(mark):
     with pytest.raises(SettingsError, match=rf"^env\.{next(iter(mark))} must be left out, got "):
         build({"_target_": "builtins.dict"} | mark, place="env", allowed=["builtins.dict"])

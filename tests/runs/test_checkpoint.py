@@ -67,24 +67,24 @@ def test_a_failed_save_keeps_the_file_before(tmp_path):
 
 
 class TestFilesThatDoNotFit:
-    def test_other_sizes(self, tmp_path):
+    def test_weights_of_other_sizes_are_refused(self, tmp_path):
         save_weights(nn.Linear(2, 2), tmp_path / "weights.safetensors")
         with pytest.raises(ValueError, match=r"weights\.safetensors does not fit this policy; .*settings of its run"):
             load_weights(nn.Linear(3, 2), tmp_path / "weights.safetensors")
 
-    def test_another_module(self, tmp_path):
+    def test_weights_of_another_module_are_refused(self, tmp_path):
         save_weights(nn.LSTM(2, 2), tmp_path / "weights.safetensors")
         with pytest.raises(ValueError, match="does not fit this policy"):
             load_weights(nn.Linear(2, 2), tmp_path / "weights.safetensors")
 
     @pytest.mark.parametrize("content", [b"", b"no weights at all", bytes(64)], ids=["empty", "text", "zeros"])
-    def test_another_kind_of_file(self, tmp_path, content):
+    def test_another_kind_of_file_is_refused(self, tmp_path, content):
         path = tmp_path / "weights.safetensors"
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"weights\.safetensors must be a safetensors file, got .*; "):
             load_weights(nn.Linear(2, 2), path)
 
-    def test_a_missing_file(self, tmp_path):
+    def test_a_missing_file_is_refused(self, tmp_path):
         with pytest.raises(ValueError, match=r"path must name a weights file, got .*nothing\.safetensors; "):
             load_weights(nn.Linear(2, 2), tmp_path / "nothing.safetensors")
 
@@ -135,7 +135,7 @@ class TestRetention:
         assert (checkpoints.best().name[-2:], checkpoints.newest().name[-2:]) == ("20", "60")
         assert self.save(checkpoints, (70, 0.9), 80, 90, 100) == [70, 90, 100]
 
-    def test_as_many_as_asked_for(self, tmp_path):
+    def test_keep_last_checkpoints_are_kept(self, tmp_path):
         assert self.save(Checkpoints(tmp_path, keep_last=4), *range(0, 100, 10)) == [60, 70, 80, 90]
         with pytest.raises(ValueError, match="keep_last must be >= 2, got 1; "):
             Checkpoints(tmp_path, keep_last=1)
@@ -145,12 +145,12 @@ class TestRetention:
         self.save(checkpoints, 10, 20)
         assert checkpoints.best() == checkpoints.newest()
 
-    def test_of_equal_scores_and_of_negative_ones(self, tmp_path):
+    def test_the_best_is_the_later_of_equal_scores_and_may_be_negative(self, tmp_path):
         checkpoints = Checkpoints(tmp_path, keep_last=5)
         self.save(checkpoints, (10, -2.0), (20, -1.0), (30, -1.0), 40)
         assert checkpoints.best().name.endswith("30")
 
-    def test_a_score_of_nothing_is_a_score(self, tmp_path):
+    def test_a_score_of_zero_counts(self, tmp_path):
         checkpoints = Checkpoints(tmp_path, keep_last=5)
         self.save(checkpoints, (10, -1.0), (20, 0.0), 30)
         assert checkpoints.best().name.endswith("20")
@@ -162,19 +162,19 @@ class TestRetention:
         checkpoints.load({"part": copy}, path)
         assert copy.state == "new" and [each.name for each in tmp_path.iterdir()] == [path.name]
 
-    def test_an_empty_or_missing_folder_has_none(self, tmp_path):
+    def test_an_empty_or_missing_folder_has_no_checkpoints(self, tmp_path):
         for folder in (tmp_path, tmp_path / "missing"):
             assert Checkpoints(folder).newest() is None and Checkpoints(folder).best() is None
             Checkpoints(folder).clean_up()
 
-    def test_going_back_removes_what_came_later(self, tmp_path):
+    def test_going_back_removes_later_checkpoints(self, tmp_path):
         """Else it would be kept in place of what is saved from now on."""
         checkpoints = Checkpoints(tmp_path, keep_last=3)
         self.save(checkpoints, 10, 20, (30, 1.0))
         checkpoints.go_back_to(10)
         assert self.save(checkpoints, 15) == [10, 15]
 
-    def test_and_damaged_ones_but_nothing_else(self, tmp_path):
+    def test_going_back_removes_damaged_checkpoints_but_nothing_else(self, tmp_path):
         checkpoints = Checkpoints(tmp_path, keep_last=3)
         self.save(checkpoints, 10, 20)
         (tmp_path / "checkpoint-000000000010" / "manifest.json").unlink()
@@ -204,7 +204,7 @@ class TestMemories:
         ("replay", "newest", "before"),
         [(True, [30, 30, 30], [20, 20, 20]), ("last", [30, 30, 30], [20, None, None]), (False, [30, None, None], None)],
     )
-    def test_which_checkpoints_hold_them(self, tmp_path, replay, newest, before):
+    def test_the_replay_argument_decides_which_checkpoints_hold_memories(self, tmp_path, replay, newest, before):
         checkpoints = self.save(tmp_path, replay)
         assert sorted(path.name[-2:] for path in tmp_path.iterdir()) == ["20", "30"]
         for step, expected in ((30, newest), (20, before or [20, None, None])):
@@ -213,18 +213,18 @@ class TestMemories:
             assert states == expected
             assert missing == ([] if None not in expected else ["memory-a", "memory-b"])
 
-    def test_other_components_must_be_there(self, tmp_path):
+    def test_only_memories_may_be_missing(self, tmp_path):
         checkpoints = self.save(tmp_path, True)
         with pytest.raises(CheckpointError, match="does not fit"):
             checkpoints.load({"other": State()}, checkpoints.newest())
 
-    def test_the_best_is_still_the_best_without_them(self, tmp_path):
+    def test_the_best_checkpoint_stays_the_best_without_its_memories(self, tmp_path):
         checkpoints = Checkpoints(tmp_path, replay="last")
         for step, score in ((10, 0.5), (20, 0.1), (30, None), (40, None)):
             checkpoints.save({"part": State(step), "memory-a": State(step)}, step=step, score=score)
         assert checkpoints.best().name.endswith("10") and self.load(checkpoints, 10)[1] == ["memory-a", "memory-b"]
 
-    def test_damage_is_not_covered_up(self, tmp_path):
+    def test_removing_memories_does_not_hide_damage(self, tmp_path):
         checkpoints = self.save(tmp_path, "last", steps=(10,))
         (damaged,) = tmp_path.glob("*/components/*-part/structure.json")
         damaged.write_text("20")
@@ -233,7 +233,7 @@ class TestMemories:
             self.load(checkpoints, 10)
 
     @pytest.mark.parametrize("call", range(4))
-    def test_killed_on_the_way_both_checkpoints_are_whole(self, tmp_path, monkeypatch, call):
+    def test_a_kill_while_memories_are_removed_leaves_both_checkpoints_whole(self, tmp_path, monkeypatch, call):
         """Before the copy, before and between the renames, before what was replaced is removed."""
         checkpoints = self.save(tmp_path, "last", steps=(10,))
         calls = iter(range(9))
@@ -256,7 +256,7 @@ class TestMemories:
         assert sorted(path.name[-2:] for path in tmp_path.iterdir()) == ["10", "20"]
         assert self.load(checkpoints, 10)[0][0] == 10 and self.load(checkpoints, 20)[0] == [20, 20, 20]
 
-    def test_wrong_settings(self, tmp_path):
+    def test_wrong_arguments_are_refused(self, tmp_path):
         with pytest.raises(ValueError, match=r"replay must be True, False or 'last', got 'first'; "):
             Checkpoints(tmp_path, replay="first")
 
@@ -269,7 +269,7 @@ def make_folder(path, files=("manifest.json",)):
 
 
 class TestCleanUp:
-    def test_what_killed_writes_left_is_removed(self, tmp_path):
+    def test_remains_of_killed_writes_are_removed(self, tmp_path):
         checkpoints = Checkpoints(tmp_path)
         good = checkpoints.save({"part": State(1)}, step=10)
         make_folder(tmp_path / ".checkpoint-000000000020.stage-0123abcd")
@@ -291,7 +291,7 @@ class TestCleanUp:
         checkpoints.load({"part": copy}, checkpoints.newest())
         assert copy.state == "before" and list(tmp_path.iterdir()) == [path]
 
-    def test_it_does_not_follow_links(self, tmp_path):
+    def test_cleaning_up_does_not_follow_links(self, tmp_path):
         precious = make_folder(tmp_path / "precious")
         (tmp_path / "checkpoints").mkdir()
         (tmp_path / "checkpoints" / ".checkpoint-1.stage-0").symlink_to(precious)
@@ -336,7 +336,7 @@ DAMAGES = {
 
 class TestDamage:
     @pytest.mark.parametrize("damage", DAMAGES)
-    def test_of_any_file_is_found_and_the_one_before_is_taken(self, saved, damage):
+    def test_damage_to_any_file_is_found_and_the_checkpoint_before_is_taken(self, saved, damage):
         checkpoints, newest = saved
         before, backup = newest.with_name("checkpoint-000000000096"), newest.with_name("backup")
         names = files_of(newest)
@@ -353,7 +353,7 @@ class TestDamage:
             shutil.copyfile(backup / name, newest / name)
         assert checkpoints.newest() == newest
 
-    def test_a_damaged_best_is_passed_over(self, saved):
+    def test_a_damaged_best_checkpoint_is_skipped(self, saved):
         checkpoints, newest = saved
         best = checkpoints.save({"part": State(1)}, step=64, score=1.0)
         assert checkpoints.best() == best
@@ -379,7 +379,7 @@ class TestDamage:
         assert checkpoints.newest() == newest
 
     @pytest.mark.parametrize("kind", ["folder", "file", "missing", "torchrl", "torch"])
-    def test_what_is_no_checkpoint_is_refused(self, saved, tmp_path, kind):
+    def test_something_other_than_a_checkpoint_is_refused(self, saved, tmp_path, kind):
         checkpoints, _ = saved
         path = tmp_path / "foreign"
         if kind == "folder":
@@ -393,7 +393,7 @@ class TestDamage:
         with pytest.raises(CheckpointError, match=r"foreign is not a checkpoint of this package \(checksums\.json: "):
             checkpoints.load({"part": State()}, path)
 
-    def test_one_of_another_training_is_refused(self, saved, tmp_path):
+    def test_a_checkpoint_of_another_training_is_refused(self, saved, tmp_path):
         _, newest = saved
         for changes in ({"name": "drqn"}, {"learner": {"capacity": 200}, "name": "v1"}):
             trainer = make_training(tmp_path / "other", **changes)
@@ -428,7 +428,7 @@ def change_manifest(checkpoint, change):
 
 
 class TestHostileCheckpoints:
-    """Checksums that fit: whoever wrote these meant it."""
+    """Checkpoints whose checksums fit, written by an attacker."""
 
     @pytest.fixture
     def hostile(self, tmp_path):
@@ -470,31 +470,31 @@ class TestHostileCheckpoints:
         [[], "text", 3, None, {}, {"format": "torchrl.checkpoint"}, {"format": "other", "format_version": 1}],
         ids=str,
     )
-    def test_a_manifest_that_is_none(self, hostile, manifest):
+    def test_a_malformed_manifest_is_refused(self, hostile, manifest):
         checkpoints, path = hostile
         forge(path, "manifest.json", manifest)
         assert "is not a checkpoint of this package (manifest.json: " in self.refused(checkpoints, path)
 
     @pytest.mark.parametrize("place", ["../../../elsewhere", "/etc", "components/../../.."])
-    def test_a_manifest_that_leads_elsewhere(self, hostile, place):
+    def test_a_manifest_that_leads_elsewhere_is_refused(self, hostile, place):
         checkpoints, path = hostile
         change_manifest(path, lambda manifest: manifest["components"]["policy"].update(path=place))
         assert "Unsafe archive member path" in self.refused(checkpoints, path)
 
-    def test_checksums_of_files_elsewhere(self, hostile, tmp_path):
+    def test_checksums_of_files_elsewhere_are_refused(self, hostile, tmp_path):
         checkpoints, path = hostile
         (tmp_path / "secret").write_text("secret")
         forge(path, "../../secret", b"secret")
         assert "../../secret lies outside of it" in self.refused(checkpoints, path)
 
-    def test_a_link_to_a_file_elsewhere(self, hostile, tmp_path):
+    def test_a_link_to_a_file_elsewhere_is_refused(self, hostile, tmp_path):
         checkpoints, path = hostile
         file = path / "components" / "0000-policy" / "tensors.safetensors"
         file.rename(tmp_path / "elsewhere")
         file.symlink_to(tmp_path / "elsewhere")
         assert "got a symbolic link" in self.refused(checkpoints, path)
 
-    def test_a_file_without_a_checksum(self, hostile):
+    def test_a_file_without_a_checksum_is_refused(self, hostile):
         checkpoints, path = hostile
         sums = json.loads((path / "checksums.json").read_text())
         del sums["components/0000-policy/tensors.safetensors"]
@@ -524,17 +524,17 @@ class TestHostileCheckpoints:
         ],
         ids=str,
     )
-    def test_a_structure_that_means_nothing(self, hostile, structure):
+    def test_a_meaningless_structure_is_refused(self, hostile, structure):
         checkpoints, path = hostile
         forge(path, "components/0000-policy/structure.json", structure)
         self.refused(checkpoints, path)
 
-    def test_a_structure_that_is_too_deep(self, hostile):
+    def test_a_structure_that_is_too_deep_is_refused(self, hostile):
         checkpoints, path = hostile
         forge(path, "components/0000-policy/structure.json", b'{"list":[' * 50_000 + b"]}" * 50_000)
         self.refused(checkpoints, path)
 
-    def test_a_manifest_and_checksums_that_are_too_deep(self, hostile):
+    def test_a_manifest_and_checksums_that_are_too_deep_are_refused(self, hostile):
         checkpoints, path = hostile
         forge(path, "manifest.json", b"[" * 100_000 + b"]" * 100_000)
         self.refused(checkpoints, path)
@@ -543,7 +543,7 @@ class TestHostileCheckpoints:
 
 
 class TestLoadPolicy:
-    def test_best_last_and_by_path(self, tmp_path):
+    def test_a_policy_is_loaded_from_the_best_the_last_or_a_path(self, tmp_path):
         checkpoints, policies = Checkpoints(tmp_path), [nn.Linear(1, 1) for _ in range(3)]
         paths = [
             checkpoints.save({"policy": policy}, step=step, score=score)
@@ -564,11 +564,11 @@ class TestLoadPolicy:
             ("nowhere", "checkpoint can't be loaded: nowhere is not a checkpoint of this package"),
         ],
     )
-    def test_there_is_none(self, tmp_path, which, message):
+    def test_a_missing_checkpoint_is_reported(self, tmp_path, which, message):
         with pytest.raises(ValueError, match=message):
             load_policy(nn.Linear(1, 1), tmp_path / "checkpoints", which)
 
-    def test_it_does_not_fit(self, tmp_path):
+    def test_a_checkpoint_that_does_not_fit_is_refused(self, tmp_path):
         Checkpoints(tmp_path).save({"policy": nn.Linear(2, 2)}, step=1)
         with pytest.raises(ValueError, match=r"checkpoint can't be loaded: .* does not fit; "):
             load_policy(nn.Linear(3, 2), tmp_path)

@@ -31,7 +31,7 @@ def test_a_second_collector_goes_on_with_the_same_steps(name):
     assert expected[0]["is_init"].any() and not expected[0]["is_init"][:, 0].all()  # some went on in mid-episode
 
 
-def test_its_state_is_a_copy():
+def test_the_state_of_a_collector_is_a_copy():
     _, collector = make("v2")
     batches = iter(collector)
     next(batches)
@@ -46,7 +46,7 @@ def test_its_state_is_a_copy():
     assert (state["carrier"] == before[0]).all()
 
 
-def test_it_stops_where_all_frames_together_are_done():
+def test_a_resumed_collector_stops_at_total_frames():
     _, first = make("drqn", total_frames=48)
     batches = iter(first)
     for _ in range(2):
@@ -56,24 +56,24 @@ def test_it_stops_where_all_frames_together_are_done():
     assert len(list(second)) == 2
 
 
-def test_its_state_holds_no_policy():
+def test_the_state_of_a_collector_holds_no_policy():
     _, collector = make("drqn")
     assert set(collector.state_dict()) == {"env_state_dict", "frames", "iter", "traj_pool", "base_env", "carrier"}
 
 
-def test_an_environment_that_keeps_its_state_to_itself_is_refused():
+def test_an_environment_without_a_state_is_refused():
     with pytest.raises(
         ValueError, match=r"the environment must return its state from state_dict\(\), got nothing from"
     ):
         ResumableCollector(GymEnv("CartPole-v1"), frames_per_batch=4, total_frames=8)
 
 
-def test_so_are_several_of_them():
+def test_several_environments_without_a_state_are_refused():
     with pytest.raises(ValueError, match=r"use torchrl\.collectors\.Collector without checkpoints"):
         ResumableCollector(SerialEnv(2, lambda: GymEnv("CartPole-v1")), frames_per_batch=4, total_frames=8)
 
 
-def test_several_environments_in_one_go_on_as_well():
+def test_several_environments_in_one_are_resumed():
     def collector(seed):
         worlds = SerialEnv(2, lambda: small_env(2, seed=seed))
         return ResumableCollector(TransformedEnv(worlds, InitTracker()), frames_per_batch=16, total_frames=-1)

@@ -6,7 +6,7 @@ from hdrqn_torchrl.learning import PhaseOne
 
 
 class Actions:
-    """A monitor of a user's own: how many actions were taken, in all and since the last row."""
+    """A user's monitor: the number of actions taken, in all and since the last row."""
 
     def __init__(self):
         self.total = self.recent = 0
@@ -27,7 +27,7 @@ class Actions:
         self.total, self.recent = state["total"], state["recent"]
 
 
-def test_a_monitor_of_ones_own_is_logged_cleared_and_stored(tmp_path):
+def test_a_users_monitor_is_logged_cleared_and_stored(tmp_path):
     trainer = make_training(tmp_path, total_frames=192, evaluation_frames=10**6)
     trainer.algorithm.monitors["actions"] = Actions()
     trainer.train()
@@ -39,7 +39,7 @@ def test_a_monitor_of_ones_own_is_logged_cleared_and_stored(tmp_path):
     assert (other.algorithm.monitors["actions"].total, other.algorithm.monitors["actions"].recent) == (192, 0)
 
 
-def test_phases_as_earlier_versions_stored_them_are_refused_by_a_sentence_that_says_so(tmp_path):
+def test_phases_stored_by_earlier_versions_are_refused_with_the_reason(tmp_path):
     trainer = make_training(tmp_path, options={"phase_one": PhaseOne()})
     phases, components = trainer.algorithm.monitors["phases"], trainer._components
     trainer._components = lambda: {

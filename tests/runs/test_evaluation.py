@@ -30,7 +30,7 @@ def always_right():
 
 
 class TestEvaluate:
-    def test_averages_of_a_scripted_player(self):
+    def test_evaluate_averages_the_episodes_of_a_scripted_player(self):
         """Going right finds the goal at once or never: 1 step and a return of 1, or 3 steps and nothing."""
         env = pair_env(200)
         env.set_seed(5)
@@ -115,7 +115,7 @@ class TestEvaluate:
         following, _ = worlds_and_steps(RIGHT, seed=8)
         assert (following != right).flatten(1).any(1).float().mean() > 0.5
 
-    def test_the_first_round_has_the_seed_that_was_given(self):
+    def test_the_first_round_has_the_given_seed(self):
         env = pair_env(8)
         env.set_seed(3)
         on_the_right = env.reset()["observation"][:, 1, 2] == 3
@@ -126,13 +126,13 @@ class TestEvaluate:
         assert len(set(seeds)) == 400 and all(0 <= seed < 2**31 for seed in seeds)
         assert isinstance(seed_of_round(-5, 1), int)
 
-    def test_the_training_streams_of_random_numbers_go_on_untouched(self, agent):
+    def test_the_random_numbers_of_training_are_untouched(self, agent):
         env, policy = agent
         before = torch.get_rng_state()
         evaluate(env, policy, episodes=8, exploration_type=ExplorationType.RANDOM)
         assert (torch.get_rng_state() == before).all()
 
-    def test_it_is_greedy_unless_told_otherwise(self, agent):
+    def test_evaluation_is_greedy_by_default(self, agent):
         env, policy = agent
         greedy = evaluate(env, policy, episodes=8)
         for level in (policy.sub_controller, policy.meta_controller):
@@ -178,7 +178,7 @@ class TestEpisodeTracker:
 
 
 class TestTasksOfOthers:
-    """A user's environment has fewer entries, and its episodes may be long or have no end."""
+    """A user's environment may have fewer entries, and episodes that are long or never end."""
 
     STATED = Task(max_steps=6, ordered=True)
 
@@ -196,7 +196,7 @@ class TestTasksOfOthers:
             ("dqn", ("attained", "extrinsic_reward", "hazard", "success"), None, set()),
         ],
     )
-    def test_a_result_has_the_figures_that_agent_and_environment_know(self, name, without, task, figures):
+    def test_a_result_has_the_figures_that_agent_and_environment_provide(self, name, without, task, figures):
         env = Corridor(4, without=without, task=task)
         algorithm = build(name, env)
         played = play(algorithm.transform(env), algorithm.policy, episodes=4)
@@ -205,13 +205,13 @@ class TestTasksOfOthers:
         assert set(result) == set(result["intervals"]) | {"episodes", "per_subgoal", "intervals"}
         assert len(result["per_subgoal"]) == (0 if name == "dqn" else 2)
 
-    def test_large_rewards_are_no_goals_in_order(self):
-        """Ten a goal, and many of them: the rate was 13.5 once."""
+    def test_large_rewards_do_not_count_as_goals_in_order(self):
+        """Ten for each of many goals: the rate was once reported as 13.5."""
         result = self.played(pays=27.0, without=("success",))
         assert "in_order_rate" not in result
         assert "in_order" not in EpisodeTracker().finished(collect(build("v1", Corridor(4)), Corridor(4), 8)[0])
 
-    def test_an_episode_without_end_is_an_error_and_not_for_ever(self, monkeypatch):
+    def test_an_episode_without_end_is_an_error(self, monkeypatch):
         monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.LONGEST_EPISODE", 40)
         with pytest.raises(
             ValueError, match=r"env must end its episodes, got 4 of 4 .* after 40 steps; give it a time"
@@ -221,7 +221,7 @@ class TestTasksOfOthers:
             self.played(length=6, task=Task(max_steps=5))
         assert self.played(length=41, task=Task(max_steps=41))["steps_mean"] == 41
 
-    def test_a_long_wait_for_the_end_of_an_episode_is_told(self, monkeypatch):
+    def test_a_long_wait_for_the_end_of_an_episode_is_announced(self, monkeypatch):
         monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.PATIENCE", 20)
         with pytest.warns(UserWarning, match=r"got 4 of 4 that have not ended after 20 steps; .* or for max_steps"):
             self.played(length=30)
@@ -236,7 +236,7 @@ class TestTasksOfOthers:
         result = evaluate(algorithm.transform(env), algorithm.policy, episodes=8, max_steps=9)
         assert (result["steps_mean"], result["cut_off_rate"], result["episodes"]) == (steps, cut, 8)
 
-    def test_what_was_collected_until_then_counts(self):
+    def test_the_return_of_an_episode_until_its_cut_off_counts(self):
         env = Corridor(4, length=None)  # to the right end in two steps, and there it stays
         right = TensorDictModule(lambda place: torch.ones(len(place), dtype=torch.int64), ["observation"], ["action"])
         assert evaluate(env, right, episodes=4, max_steps=7)["return_mean"] == 1.0
@@ -245,7 +245,7 @@ class TestTasksOfOthers:
 
 
 class TestPerSubgoal:
-    def test_goals_of_a_scripted_walk(self):
+    def test_subgoals_attained_and_reached_on_a_scripted_walk_are_counted(self):
         """In a row of three cells, going right from its left end takes both goals."""
         env = subgoal_env(1, env_settings={"layout": ("#####", "#   #", "#####"), "num_obstacles": 0, "max_steps": 2})
         chosen = torch.tensor([0])
@@ -282,17 +282,17 @@ class TestIntervals:
         assert width(50) == pytest.approx(4 * 0.5 / 50**0.5, rel=0.3)  # 1.96 standard errors of a coin, twice
         assert width(800) == pytest.approx(width(50) / 4, rel=0.3)
 
-    def test_figures_that_never_differ_have_none(self):
+    def test_figures_that_never_differ_have_no_interval(self):
         """Between walls above and below nobody who goes up (0) moves."""
         intervals = summarise(play(pair_env(4), always(0), episodes=8))["intervals"]
         assert intervals["return_mean"] is None and intervals["steps_mean"] is None
 
-    def test_one_episode_has_none_but_of_rates(self):
+    def test_one_episode_has_intervals_of_rates_only(self):
         intervals = summarise(play(pair_env(1), always_right(), episodes=1))["intervals"]
         assert intervals["return_mean"] is None
         assert intervals["success_rate"] in ([0.0, pytest.approx(0.975)], [pytest.approx(0.025), 1.0])
 
-    def test_a_rate_of_0_or_1_leaves_room(self):
+    def test_a_rate_of_0_or_1_has_an_interval(self):
         """Between walls above and below nobody who goes up (0) moves."""
         played = play(pair_env(50), always(0), episodes=100)
         low, high = summarise(played)["intervals"]["success_rate"]
@@ -327,7 +327,7 @@ def test_legs_are_those_of_the_episodes_that_are_reported():
     assert played["steps"].min() < 40  # some were done early
 
 
-def test_places_beyond_the_screen_count_at_its_edge():
+def test_places_outside_the_screen_count_at_its_edge():
     places = PlaceCounter(5, 6, cell=2)  # 3 rows of 3
     position = torch.tensor([[0.0, 0.0], [-3.0, 1.9], [99.0, 4.0], [3.0, 99.0]])
     places.add_step(TensorDict({"next": {"position": position}}, [4]))

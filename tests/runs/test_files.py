@@ -69,7 +69,7 @@ def test_only_regular_files_are_opened_or_removed(folder, secret, kind, use):
     assert place.is_symlink() or place.exists()
 
 
-def test_a_second_name_of_a_file_elsewhere_is_not_written_to(folder, secret):
+def test_a_hard_link_to_a_file_elsewhere_is_not_written_to(folder, secret):
     os.link(secret, folder / "file.json")
     for use in ("append", "open"):
         with pytest.raises(RunFileError, match=r"got a file with other names \(hard links\)"):
@@ -78,7 +78,7 @@ def test_a_second_name_of_a_file_elsewhere_is_not_written_to(folder, secret):
     assert read_json(folder / "file.json") == 1
 
 
-def test_a_folder_below_the_run_folder_is_no_link_but_the_run_folder_may_be_one(folder, tmp_path):
+def test_the_run_folder_may_be_a_link_but_no_folder_inside_it(folder, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "file.json").write_text("3")
     (folder / "checkpoints").symlink_to(tmp_path / "elsewhere")
@@ -92,7 +92,7 @@ def test_a_folder_below_the_run_folder_is_no_link_but_the_run_folder_may_be_one(
     assert read_json(tmp_path / "alias" / "checkpoints" / "file.json", root=tmp_path / "alias") == 5
 
 
-def test_a_file_lies_below_its_root(folder, secret):
+def test_a_file_outside_the_root_is_refused(folder, secret):
     with pytest.raises(RunFileError, match="must lie in"):
         check_file(secret, root=folder)
 
@@ -107,7 +107,7 @@ def test_a_file_larger_than_any_run_writes_is_not_read(folder, size):
     assert time.monotonic() - started < 1
 
 
-def test_as_large_as_allowed_it_is(folder):
+def test_a_file_of_the_largest_allowed_size_is_read(folder):
     (folder / "file").write_bytes(bytes(10))
     assert read_bytes(folder / "file", limit=10) == bytes(10)
     with pytest.raises(RunFileError, match="at most 9 bytes, got 10"):
@@ -117,13 +117,13 @@ def test_as_large_as_allowed_it_is(folder):
 @pytest.mark.parametrize(
     "text", ["", "{", "[" * 100_000 + "]" * 100_000, "9" * 5000, "\udcff"], ids=lambda text: text[:3]
 )
-def test_what_is_no_json_is_told_in_a_sentence(folder, text):
+def test_malformed_json_is_reported_in_one_sentence(folder, text):
     (folder / "run.json").write_bytes(text.encode(errors="surrogateescape"))
     with pytest.raises(RunFileError, match=r"run\.json must be a JSON file, got something else \(.*\)\.$"):
         read_json(folder / "run.json")
 
 
-def test_a_file_that_is_not_there(folder):
+def test_a_missing_file_can_be_created_or_removed_but_not_read(folder):
     for use in (read_text, read_json):
         with pytest.raises(FileNotFoundError):
             use(folder / "run.json")
@@ -139,7 +139,7 @@ def test_a_file_that_is_not_there(folder):
 class TestWriting:
     @pytest.mark.parametrize("kind", ["link", "device", "dangling", "pipe"])
     @pytest.mark.parametrize("name", ["run.json", "run.partial.json"])
-    def test_what_is_in_the_way_is_replaced_and_not_followed(self, folder, secret, kind, name):
+    def test_a_link_or_pipe_in_the_way_is_replaced_and_not_followed(self, folder, secret, kind, name):
         put(kind, folder / name, secret)
         write_whole(folder / "run.json", "[]")
         assert (folder / "run.json").read_text() == "[]" and not (folder / "run.json").is_symlink()
@@ -152,7 +152,7 @@ class TestWriting:
             _ = 1 / 0
         assert read_json(folder / "run.json") == "before" and len(list(folder.iterdir())) == 1
 
-    def test_not_through_a_link(self, folder, tmp_path):
+    def test_a_file_behind_a_link_is_not_written(self, folder, tmp_path):
         (tmp_path / "elsewhere").mkdir()
         (folder / "evaluations").symlink_to(tmp_path / "elsewhere")
         with pytest.raises(RunFileError, match=r"evaluations must be .* got a symbolic link"):

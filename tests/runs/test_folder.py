@@ -58,18 +58,18 @@ class TestLocked:
         with locked(tmp_path / "run"):
             pass
 
-    def test_who_waits_is_told_for_whom(self, tmp_path):
-        told = []
+    def test_a_waiting_process_reports_who_holds_the_folder(self, tmp_path):
+        reported = []
         with (
             locked(tmp_path),
             pytest.raises(ValueError, match="is in use"),
-            locked(tmp_path, patience_seconds=0.3, tell=told.append),
+            locked(tmp_path, patience_seconds=0.3, tell=reported.append),
         ):
             raise AssertionError("both are in")
         who = f"process {os.getpid()} on {socket.gethostname()}"
-        assert told == [f"{tmp_path} is in use: waiting for {who}, which is training there"]
+        assert reported == [f"{tmp_path} is in use: waiting for {who}, which is training there"]
 
-    def test_one_after_the_other_in_a_process(self, tmp_path):
+    def test_one_process_can_lock_a_folder_repeatedly(self, tmp_path):
         for _ in range(2):
             with pytest.raises(ZeroDivisionError), locked(tmp_path):
                 _ = 1 / 0
@@ -81,7 +81,7 @@ class TestLocked:
             raise AssertionError("both are in")
 
     @pytest.mark.parametrize("kind", ["link", "pipe", "folder"])
-    def test_what_is_no_lock_is_refused_and_a_link_is_not_followed(self, tmp_path, kind):
+    def test_something_other_than_a_lock_file_is_refused_and_a_link_is_not_followed(self, tmp_path, kind):
         (tmp_path / "mine").write_text("mine")
         (tmp_path / "run").mkdir()
         place = tmp_path / "run" / ".lock"
@@ -92,7 +92,7 @@ class TestLocked:
             raise AssertionError("it is in")
         assert (tmp_path / "mine").read_text() == "mine"
 
-    def test_a_folder_that_can_not_be_written(self, tmp_path):
+    def test_an_unwritable_folder_is_refused(self, tmp_path):
         (tmp_path / "file").write_text("")
         with (
             pytest.raises(

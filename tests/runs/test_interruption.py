@@ -11,7 +11,7 @@ from hdrqn_torchrl.runs.interruption import SIGNALS, Interrupted, StopRequest
 
 @pytest.mark.parametrize(("number", "name", "code"), [(signal.SIGINT, "SIGINT", 130), (signal.SIGTERM, "SIGTERM", 143)])
 class TestOneSignal:
-    def test_it_waits_for_the_next_check(self, number, name, code):
+    def test_a_stop_signal_waits_for_the_next_check(self, number, name, code):
         passed = False
         with StopRequest() as stop:
             stop.check()
@@ -21,7 +21,7 @@ class TestOneSignal:
                 stop.check()
         assert passed and (reason.value.number, reason.value.exit_code) == (number, code)
 
-    def test_a_second_one_does_not_wait(self, number, name, code, monkeypatch):
+    def test_a_second_stop_signal_does_not_wait(self, number, name, code, monkeypatch):
         clock = [100.0]
         monkeypatch.setattr(time, "monotonic", lambda: clock[0])
         with StopRequest():
@@ -33,7 +33,7 @@ class TestOneSignal:
                 signal.raise_signal(number)
         assert not isinstance(reason.value, Interrupted)
 
-    def test_during_long_work_it_is_answered_at_once(self, number, name, code):
+    def test_a_stop_signal_during_long_work_is_answered_at_once(self, number, name, code):
         with StopRequest() as stop:
             with pytest.raises(Interrupted), stop.at_once():
                 signal.raise_signal(number)
@@ -41,14 +41,14 @@ class TestOneSignal:
             with pytest.raises(Interrupted):
                 stop.check()  # still asked for
 
-    def test_long_work_does_not_begin_after_it(self, number, name, code):
+    def test_long_work_does_not_begin_after_a_stop_signal(self, number, name, code):
         with StopRequest() as stop:
             signal.raise_signal(number)
             with pytest.raises(Interrupted), stop.at_once():
                 raise AssertionError("it began")
 
 
-def test_after_long_work_a_signal_waits_again():
+def test_a_stop_signal_after_long_work_waits_again():
     with StopRequest() as stop:
         with stop.at_once():
             pass
@@ -57,7 +57,7 @@ def test_after_long_work_a_signal_waits_again():
             stop.check()
 
 
-def test_a_new_request_knows_nothing_of_the_last_one():
+def test_a_new_request_forgets_the_last_one():
     stop = StopRequest()
     with stop:
         signal.raise_signal(signal.SIGTERM)
@@ -65,7 +65,7 @@ def test_a_new_request_knows_nothing_of_the_last_one():
         stop.check()
 
 
-def test_handlers_are_given_back():
+def test_signal_handlers_are_restored():
     def mine(*_):
         pass
 
@@ -80,7 +80,7 @@ def test_handlers_are_given_back():
             signal.signal(number, handler)
 
 
-def test_in_another_thread_it_leaves_signals_alone():
+def test_signals_are_left_alone_in_another_thread():
     seen = []
 
     def work():
@@ -104,8 +104,8 @@ def wait_for_signals(path):
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_it_is_a_keyboard_interrupt_to_those_who_do_not_know_it(tmp_path, number):
-    """A process of its own that nobody kept from ending."""
+def test_a_stop_that_nobody_catches_ends_the_process_with_exit_code_1(tmp_path, number):
+    """In a process of its own."""
     process = start(wait_for_signals, tmp_path / "ready")
     deadline = time.monotonic() + 60
     while not (tmp_path / "ready").exists() and time.monotonic() < deadline:

@@ -1,4 +1,4 @@
-"""Whatever is played beside a training, the training goes on as if it had not been."""
+"""A training goes on as if nothing had been played meanwhile."""
 
 import random
 
@@ -25,7 +25,7 @@ def draw():
 
 
 class Observer(nn.Module):
-    """A policy with all the state that one can have: running averages, dropout, a counter of its own."""
+    """A policy with every kind of state: running averages, dropout, a counter."""
 
     def __init__(self):
         super().__init__()
@@ -50,7 +50,7 @@ def with_an_error(env, policy):
 
 
 @pytest.mark.parametrize("play", [in_order, with_an_error])
-def test_nothing_is_changed(play):
+def test_playing_changes_no_state_of_the_training(play):
     policy = TensorDictModule(Observer(), ["observation"], ["action"])
     modes = [module.training for module in policy.modules()]
     buffers = {name: buffer.clone() for name, buffer in policy.named_buffers()}
@@ -63,14 +63,14 @@ def test_nothing_is_changed(play):
     assert exploration_type() == kind
 
 
-def test_recording_changes_nothing_either():
+def test_recording_changes_no_state_of_the_training():
     env = small_env(1)
     agent, state = build("v3", env), torch.get_rng_state()
     record_episodes(agent.transform(env), agent, epsilon=0.5)
     assert torch.equal(torch.get_rng_state(), state) and agent.policy.training
 
 
-def test_inside_the_seed_decides_on_every_stream_and_modules_do_not_train():
+def test_the_seed_decides_every_stream_inside_and_modules_are_not_in_training_mode():
     env, policy, found = small_env(2), TensorDictModule(Observer(), ["observation"], ["action"]), []
     for seed in (3, 3, 4, 2**33):
         draw()
@@ -82,7 +82,7 @@ def test_inside_the_seed_decides_on_every_stream_and_modules_do_not_train():
     assert all(first != second for first, second in zip(found[1][:3], found[2][:3], strict=True))
 
 
-def test_a_gpus_numbers_go_on_as_well(monkeypatch):
+def test_the_random_numbers_of_gpus_are_restored(monkeypatch):
     """Generators that stand for those of two GPUs."""
     gpus, inside = [torch.Generator().manual_seed(seed) for seed in (7, 8)], []
     monkeypatch.setattr(torch.cuda, "default_generators", gpus)
@@ -95,7 +95,7 @@ def test_a_gpus_numbers_go_on_as_well(monkeypatch):
     assert inside[0] == inside[1] != [torch.rand(3, generator=gpu).tolist() for gpu in gpus]
 
 
-def test_without_a_seed_the_numbers_go_on_inside():
+def test_without_a_seed_the_streams_continue_inside():
     torch.manual_seed(0)
     with own_random_numbers():
         inside = draw()

@@ -42,7 +42,7 @@ def hold(path, with_flock):
         time.sleep(60)
 
 
-def test_one_after_the_other(tmp_path, system):
+def test_a_lock_can_be_taken_again_after_its_release(tmp_path, system):
     for _ in range(2):
         with pytest.raises(ZeroDivisionError), lock(tmp_path / "x"):
             _ = 1 / 0
@@ -51,12 +51,12 @@ def test_one_after_the_other(tmp_path, system):
     assert [path.name for path in tmp_path.iterdir()] == ["x"]
 
 
-def test_two_locks_in_a_folder_do_not_meet(tmp_path, system):
+def test_two_locks_in_a_folder_are_independent(tmp_path, system):
     with lock(tmp_path / "x"), lock(tmp_path / "y"):
         pass
 
 
-def test_who_waits_gets_in_and_says_so_once(tmp_path, system):
+def test_a_waiting_process_gets_the_lock_and_reports_the_wait_once(tmp_path, system):
     told, inside = [], threading.Event()
 
     def stay():
@@ -98,29 +98,29 @@ class TestOwnersFile:
         owner = {"host": socket.gethostname(), "pid": os.getpid(), "started": locking._started(os.getpid())}
         (tmp_path / "x.owner").write_text(json.dumps(owner | changes))
 
-    def test_a_process_with_the_number_of_a_dead_one_is_not_taken_for_it(self, tmp_path):
+    def test_a_process_with_the_id_of_a_dead_one_is_not_mistaken_for_it(self, tmp_path):
         self.owner(tmp_path)
         refuse(tmp_path / "x")
         self.owner(tmp_path, started=-1)
         with lock(tmp_path / "x"):
             pass
 
-    def test_of_another_machine_nothing_is_known_and_the_message_says_what_to_do(self, tmp_path):
+    def test_an_owner_on_another_machine_is_respected_and_the_message_says_what_to_do(self, tmp_path):
         self.owner(tmp_path, host="elsewhere", started=-1)
         told = refuse(tmp_path / "x")
         assert told.startswith(f"process {os.getpid()} on elsewhere (if no such process is there any more, remove ")
         assert told.endswith("x.owner)")
 
     @pytest.mark.parametrize("content", ["", "[1]", "{", '{"pid": "7", "host": 3}', "[" * 9_000, '{"pid": -1}'])
-    def test_a_file_that_says_something_else_is_respected(self, tmp_path, content):
+    def test_an_unreadable_owner_file_is_respected(self, tmp_path, content):
         (tmp_path / "x.owner").write_text(content)
         assert "remove" in refuse(tmp_path / "x")
 
-    def test_a_pipe_in_its_place_is_not_waited_for(self, tmp_path):
+    def test_a_pipe_in_place_of_the_owner_file_is_not_waited_for(self, tmp_path):
         os.mkfifo(tmp_path / "x.owner")
         assert "remove" in refuse(tmp_path / "x")
 
-    def test_another_that_took_over_first_stays_in(self, tmp_path):
+    def test_a_process_that_took_over_first_keeps_the_lock(self, tmp_path):
         self.owner(tmp_path)
         with pytest.raises(InUse):
             locking._take_over(tmp_path / "x.owner", {"host": "dead"})
@@ -135,7 +135,7 @@ def test_the_target_of_a_link_is_left_alone(tmp_path):
     assert (tmp_path / "precious").read_text() == "kept"
 
 
-def test_other_errors_of_the_system_are_not_taken_for_a_missing_feature(tmp_path, monkeypatch):
+def test_other_errors_of_the_system_are_not_mistaken_for_missing_locks(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError(errno.EIO, "Input/output error")
 

@@ -42,7 +42,7 @@ class TestCSVLog:
         assert [path.name for path in tmp_path.iterdir()] == ["metrics.csv"]
 
     @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-    def test_what_was_not_measured_is_an_empty_cell(self, tmp_path, value):
+    def test_a_value_that_was_not_measured_is_an_empty_cell(self, tmp_path, value):
         log = CSVLog(tmp_path / "metrics.csv")
         log.write({"frames": 1, "legs/start_to_0": value, "loss": 0.5})
         log.write({"frames": 2, "legs/start_to_0": 0.25, "loss": 0.5})
@@ -89,7 +89,7 @@ class TestCSVLog:
 
 
 class TestPosition:
-    """Where a run that is resumed goes on in its table."""
+    """Where a resumed run continues in its table."""
 
     def log(self, path):
         log = CSVLog(path)
@@ -98,7 +98,7 @@ class TestPosition:
         return log
 
     @pytest.mark.parametrize("later", ["", "3,0.25\n", "3,0.25\n4,0.1", "3,0.25\n4,0.1\n5,0.0\n"])
-    def test_rows_after_it_are_dropped(self, tmp_path, later):
+    def test_rows_after_the_stored_position_are_dropped(self, tmp_path, later):
         path = tmp_path / "metrics.csv"
         state = self.log(path).state_dict()
         with path.open("a") as file:
@@ -110,7 +110,7 @@ class TestPosition:
         assert path.read_text() == "frames,loss\n1,\n2,0.5\n3,0.125\n"
         assert [each.name for each in tmp_path.iterdir()] == ["metrics.csv"]
 
-    def test_so_are_columns_that_came_after_it(self, tmp_path):
+    def test_columns_added_after_the_stored_position_are_dropped(self, tmp_path):
         path = tmp_path / "metrics.csv"
         log = self.log(path)
         state = log.state_dict()
@@ -120,7 +120,7 @@ class TestPosition:
         log.write({"frames": 3, "loss": 0.25})
         assert path.read_text() == "frames,loss\n1,\n2,0.5\n3,0.25\n"
 
-    def test_a_table_that_was_removed_begins_anew(self, tmp_path):
+    def test_a_table_that_was_removed_starts_again(self, tmp_path):
         path = tmp_path / "metrics.csv"
         state = self.log(path).state_dict()
         path.unlink()
@@ -129,7 +129,7 @@ class TestPosition:
         log.write({"frames": 3, "loss": 0.25})
         assert read(path) == [{"frames": "3", "loss": "0.25"}] and log.rows == 1
 
-    def test_one_before_the_first_row(self, tmp_path):
+    def test_a_position_before_the_first_row_empties_the_table(self, tmp_path):
         path = tmp_path / "metrics.csv"
         state = CSVLog(path).state_dict()
         self.log(path)
@@ -177,7 +177,7 @@ class TestRunLogger:
         for part in ("1,000 frames", "greedy +1.25 of 2.00", "success 50%", "2,000 frames/s", "epsilon sub 0.50"):
             assert part in lines[0]
 
-    def test_on_a_terminal_there_is_a_bar_instead(self, tmp_path):
+    def test_a_terminal_shows_a_progress_bar(self, tmp_path):
         logger, console = run_logger(tmp_path, terminal=True)
         logger.log(ROW | GREEDY)
         logger.close()
@@ -185,7 +185,7 @@ class TestRunLogger:
         assert "1,000/10,000 frames" in shown and "greedy +1.25 of 2.00" in shown
         assert "    1,000 frames  " not in shown
 
-    def test_its_position_is_that_of_the_table_and_the_last_greedy_result(self, tmp_path):
+    def test_the_position_of_a_logger_is_that_of_its_table_and_the_last_greedy_result(self, tmp_path):
         logger, _ = run_logger(tmp_path)
         logger.log(ROW | GREEDY)
         state = logger.state_dict()
@@ -197,13 +197,13 @@ class TestRunLogger:
         other.close()
         assert "greedy +1.25 of 2.00" in console.file.getvalue() and len(read(tmp_path / "metrics.csv")) == 2
 
-    def test_no_ceiling_no_mention_of_it(self, tmp_path):
+    def test_a_run_without_a_ceiling_does_not_mention_one(self, tmp_path):
         logger, console = run_logger(tmp_path)
         logger.log(ROW | {"greedy/return": -0.5, "greedy/success": 0.0})
         assert "greedy -0.50, success 0%" in console.file.getvalue()
 
 
-def test_progress_line():
+def test_the_progress_line_shows_speed_returns_and_epsilons():
     row = ROW | {"meta/updates_per_second": 5.0, "meta/epsilon": 0.25, "behaviour/return": 0.75}
     assert progress_line(row, "greedy +1.00") == (
         "2,000 frames/s, 35 updates/s | behaviour +0.75 | greedy +1.00 | epsilon sub 0.50, meta 0.25"
@@ -217,7 +217,7 @@ def test_tensorboard_files_lie_in_the_run_folder(tmp_path):
 
 
 class TestTensorboardAfterAKill:
-    """What is done again stands there once, in order."""
+    """Frames that are done again appear once, in order."""
 
     def log(self, folder, steps, state=None):
         logger, _ = run_logger(folder, loggers=[make_tensorboard_logger(folder)])
@@ -234,7 +234,7 @@ class TestTensorboardAfterAKill:
     def expected(self, steps):
         return [(step, round(1 / (1 + step), 6)) for step in steps]
 
-    def test_with_a_checkpoint(self, tmp_path):
+    def test_a_resumed_run_logs_each_point_to_tensorboard_once(self, tmp_path):
         killed = self.log(tmp_path, range(3))
         state = killed.state_dict()
         assert self.points(tmp_path) == self.expected(range(3))  # a checkpoint leaves nothing unwritten
@@ -243,14 +243,14 @@ class TestTensorboardAfterAKill:
         self.log(tmp_path, [3, 4], state).close()
         assert self.points(tmp_path) == self.expected(range(5))
 
-    def test_before_the_first_checkpoint(self, tmp_path):
+    def test_a_run_killed_before_its_first_checkpoint_logs_each_point_to_tensorboard_once(self, tmp_path):
         self.log(tmp_path, range(3)).close()
         (tmp_path / "metrics.csv").unlink()  # as a start from the beginning does
         self.log(tmp_path, range(2)).close()
         assert self.points(tmp_path) == self.expected(range(2))
 
 
-def test_what_a_service_knows_is_not_logged_twice(tmp_path):
+def test_points_that_a_service_has_are_not_logged_twice(tmp_path):
     service = FakeLogger()
     service.logged_until = 1_000
     logger, _ = run_logger(tmp_path, loggers=[service])

@@ -35,13 +35,13 @@ def task_with(player, **more):
     return Task(references={"hero": Reference(what="all there is", play=player, **more)}, ceiling="hero")
 
 
-def test_the_figures_of_the_papers_tasks_are_known_and_nobody_plays():
+def test_the_figures_of_the_papers_tasks_are_known_without_playing():
     told = []
     found = references_for(MultiGoalGridEnv(2).task, tell=told.append)
     assert list(found) == ["planner", "memory", "egocentric", "random"] and told == []
 
 
-def test_figures_are_played_when_they_are_asked_for_and_kept():
+def test_unknown_figures_are_played_when_asked_for_and_kept():
     player, told = Player(), []
     task = task_with(player, key="a task")
     assert player.calls == 0
@@ -51,7 +51,7 @@ def test_figures_are_played_when_they_are_asked_for_and_kept():
     assert told == ["the scripted player 'hero' (all there is) plays this task, for at most 120 s"]
 
 
-def test_another_task_another_version_and_a_player_without_a_key_are_played_anew(monkeypatch):
+def test_another_task_another_version_and_a_player_without_a_key_are_played_again(monkeypatch):
     player = Player()
     for key in ("a", "b"):
         references_for(task_with(player, key=key))
@@ -82,7 +82,7 @@ def test_where_nothing_can_be_kept_players_play_each_time(tmp_path, monkeypatch)
     assert player.calls == 2
 
 
-def test_a_player_whose_time_is_up_is_left_out_and_that_is_said():
+def test_a_player_whose_time_is_up_is_left_out_with_a_message():
     told, begun = [], time.monotonic()
     task = MultiGoalGridEnv(1, layout="nine_rooms", max_steps=150).task
     assert references_for(task, ["egocentric"], seconds=0.2, tell=told.append) == {}
@@ -105,7 +105,7 @@ def test_a_players_random_numbers_are_its_own():
     assert (torch.rand(2) == expected).all()
 
 
-def test_the_ceiling_is_what_the_task_calls_so():
+def test_the_task_names_its_ceiling():
     found = {"planner": {"return_mean": 2.0}, "memory": {"return_mean": 1.9}}
     assert ceiling_of(found, MultiGoalGridEnv(1).task) == 1.9
     assert ceiling_of(found, Task()) is None
@@ -121,12 +121,12 @@ def test_players_of_a_task_with_other_rewards_or_shorter_episodes_do_not_play():
     assert task_of(TransformedEnv(small_env(2), StepCounter(max_steps=10_000))).references
 
 
-def test_a_ceiling_that_is_no_reference_is_refused():
+def test_a_ceiling_that_is_not_a_reference_is_refused():
     with pytest.raises(ValueError, match=r"ceiling must be one of the references \[\], got 'memory'"):
         Task(ceiling="memory")
 
 
-def test_players_of_a_run_play_once_and_only_those_who_are_asked():
+def test_players_of_a_run_play_once_and_only_when_asked_for():
     hero, other = Player(), Player()
     both = {"hero": Reference(what="", play=hero), "other": Reference(what="", play=other)}
     players = Players(Task(references=both, ceiling="hero"))

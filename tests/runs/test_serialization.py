@@ -65,7 +65,7 @@ class TestWhatAStateMayHold:
             wanted.view(torch.uint8) if found.ndim else wanted
         )
 
-    def test_tensors_that_share_memory_come_back_apart(self, tmp_path):
+    def test_tensors_that_share_memory_come_back_separately(self, tmp_path):
         whole = torch.arange(6.0)
         found = round_trip([whole, whole, whole[2:4], whole.view(2, 3)], tmp_path)
         assert [each.tolist() for each in found] == [
@@ -77,7 +77,7 @@ class TestWhatAStateMayHold:
         found[0].fill_(-1)
         assert found[1].tolist() == [0, 1, 2, 3, 4, 5]
 
-    def test_what_came_back_does_not_depend_on_the_file(self, tmp_path):
+    def test_a_loaded_state_does_not_depend_on_the_file(self, tmp_path):
         found = round_trip({"tensor": torch.ones(1000)}, tmp_path)["tensor"]
         for file in tmp_path.rglob("*.safetensors"):
             file.write_bytes(bytes(file.stat().st_size))
@@ -104,7 +104,7 @@ class TestWhatAStateMayHold:
     @pytest.mark.parametrize(
         "value", [{1, 2}, b"bytes", object(), torch.float32, lambda: 0], ids=lambda v: str(type(v))
     )
-    def test_anything_else_is_refused_by_its_place(self, tmp_path, value):
+    def test_other_objects_are_refused_by_their_path(self, tmp_path, value):
         checkpoints = Checkpoints(tmp_path)
         with pytest.raises(TypeError, match=r"a state may hold tensors, numbers, .*at inner/0\."):
             checkpoints.save({"part": State({"inner": [value]})}, step=1)

@@ -26,7 +26,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("kind", VALUES)
-def test_what_train_py_writes_comes_back_with_its_types(read, kind):
+def test_values_written_by_train_py_come_back_with_their_types(read, kind):
     found = read(OmegaConf.to_yaml(OmegaConf.create({"a": VALUES[kind]})))
     assert found == {"a": VALUES[kind]} and repr(found) == repr({"a": VALUES[kind]})
 
@@ -52,7 +52,7 @@ output_root: out
 """
 
 
-def test_what_earlier_versions_wrote_is_filled_in_from_the_same_file(read):
+def test_references_of_earlier_versions_are_filled_in_from_the_same_file(read):
     found = read(OLD)
     assert found == OmegaConf.to_container(OmegaConf.create(OLD), resolve=True)
     assert found["algo"]["meta"] == {"learning_rate": 0.1, "tau": 0.2, "max_target": 3, "slice_len": 50}
@@ -78,7 +78,7 @@ def test_what_earlier_versions_wrote_is_filled_in_from_the_same_file(read):
         "logger: ['${logger}']",
     ],
 )
-def test_any_other_reference_is_refused_by_its_place_or_shown_as_it_stands(read, monkeypatch, text):
+def test_any_other_reference_is_refused_by_its_path_or_shown_unchanged(read, monkeypatch, text):
     monkeypatch.setenv("HOME", "/secret")
     with pytest.raises(
         RunFileError, match=r"config\.yaml can't be read as the settings of a run: \S+ must be a value, got '"
@@ -95,17 +95,17 @@ LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        (LAUGHS, "names for parts"),
-        ("a: &a [*a]", "names for parts"),
-        ("a: {b: &b 1}\nc: {<<: *b}", "names for parts"),
+        (LAUGHS, "anchors and aliases"),
+        ("a: &a [*a]", "anchors and aliases"),
+        ("a: {b: &b 1}\nc: {<<: *b}", "anchors and aliases"),
         ("a: " + "[" * 31 + "]" * 31, "nested more than 30 deep"),
         ("[" * 100_000, r"nested|depth|expected"),
         ("{a: " * 100_000, r"nested|depth|expected"),
         ("a: " + ":".join(["59"] * 100_000), "longer than 10,000 characters"),
         ("a: " + "9" * 9_000, "4300|digits"),
-        ("a: !!python/object/apply:os.system [true]", "types of values"),
-        ("a: !!binary aaaa", "types of values"),
-        ("a: 1\na: 2", "stand there once"),
+        ("a: !!python/object/apply:os.system [true]", "tags"),
+        ("a: !!binary aaaa", "tags"),
+        ("a: 1\na: 2", "occur only once"),
         ("3: 4", "every key must be a name"),
         ("? [1, 2]\n: 4", "every key must be a name"),
         ("", "must hold settings by name, got NoneType"),
@@ -117,7 +117,7 @@ LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     ],
     ids=range(19),
 )  # fmt: skip
-def test_a_file_that_asks_for_more_than_it_holds_ends_at_once_in_a_sentence(read, text, told):
+def test_a_malicious_file_is_refused_at_once_in_one_sentence(read, text, told):
     started = time.monotonic()
     with pytest.raises(RunFileError, match=rf"config\.yaml (can't be read|must have).*({told})") as refusal:
         read(text)
@@ -125,7 +125,7 @@ def test_a_file_that_asks_for_more_than_it_holds_ends_at_once_in_a_sentence(read
 
 
 @pytest.mark.parametrize("settings", [{"a": [{"b": "${c}"}]}, {"a": [{"b": float("nan")}]}], ids=str)
-def test_what_is_not_plain_is_found_by_its_place(settings):
+def test_references_and_nan_are_refused_by_their_path(settings):
     with pytest.raises(ValueError, match=r"^a\[0\]\.b must be a "):
         check_plain(settings)
     check_plain({"a": [1, None, "b$", {"c": float("inf")}]})

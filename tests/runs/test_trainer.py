@@ -28,12 +28,12 @@ from hdrqn_torchrl.runs.weights import load_policy
         (12, 12, 10, False),
     ],
 )
-def test_crossed(before, after, interval, expected):
+def test_crossed_says_whether_a_multiple_of_the_interval_was_passed(before, after, interval, expected):
     assert crossed(before, after, interval) == expected
 
 
 class Stateless:
-    """A part that a checkpoint has nothing to keep of."""
+    """A part without state."""
 
     def state_dict(self):
         return {}
@@ -123,7 +123,7 @@ class TestTime:
         trainer.train()
         assert seen == [1, 3]  # workers get the weights first
 
-    def test_it_stops_at_the_first_batch_that_completes_total_frames(self):
+    def test_training_stops_at_the_first_batch_that_completes_total_frames(self):
         trainer = make_trainer(total_frames=25)
         trainer.train()
         assert trainer.frames == 30 and trainer.collector.weight_updates == 1 + 3
@@ -139,7 +139,7 @@ class TestTime:
 
 
 class CountingLearner(Stateless):
-    """Owes a fixed number of updates for each batch; ``told`` collects what is asked of it."""
+    """Owes a fixed number of updates for each batch; ``told`` collects the calls."""
 
     learning_rate = 0.001
 
@@ -188,7 +188,7 @@ def test_all_learners_store_a_batch_before_any_learns_from_it():
     assert told == ["store", "store", "update", "update", "update"] * 2
 
 
-def test_the_ceiling_stands_beside_the_greedy_return():
+def test_the_ceiling_is_logged_beside_the_greedy_return():
     trainer = make_trainer(total_frames=10, ceiling=lambda: 2.0)
     trainer.train()
     assert all(row["greedy/ceiling"] == 2.0 for row in trainer.logger.rows)
@@ -244,34 +244,34 @@ class TestWhenItSaves:
     @pytest.mark.parametrize(
         ("interval", "steps"), [(30, [30, 60, 90, 100]), (25, [30, 50, 80, 100]), (50, [50, 100]), (1_000, [100])]
     )
-    def test_at_each_interval_of_frames_and_at_the_end(self, saved, interval, steps):
+    def test_a_checkpoint_is_saved_at_each_interval_of_frames_and_at_the_end(self, saved, interval, steps):
         assert saved(checkpoint_frames=interval) == steps
 
-    def test_when_much_time_has_passed_since_the_last(self, saved):
+    def test_a_checkpoint_is_saved_when_much_time_has_passed_since_the_last(self, saved):
         assert saved(checkpoint_seconds=60.0, seconds_per_batch=25.0) == [30, 60, 90, 100]
         assert saved(checkpoint_seconds=60.0, seconds_per_batch=25.0, checkpoint_frames=20) == [20, 40, 60, 80, 100]
 
-    def test_at_each_new_best_with_its_score(self, saved):
+    def test_a_checkpoint_is_saved_at_each_new_best_with_its_score(self, saved):
         steps = saved(results=[0.1, 0.3, 0.2, 0.5, 0.4, 0.5], evaluation_frames=20)
         assert steps == [(20, 0.3), (60, 0.5), 100]  # that before training is not kept: there is nothing to go on from
 
-    def test_on_a_stop_request_after_the_batch_that_was_under_way(self, saved):
+    def test_a_checkpoint_is_saved_on_a_stop_request_after_the_current_batch(self, saved):
         stop = {3: lambda: signal.raise_signal(signal.SIGTERM)}
         assert saved(at=stop, error=Interrupted) == [30]
 
-    def test_not_twice_in_the_same_place(self, saved):
+    def test_no_checkpoint_is_saved_twice_at_the_same_step(self, saved):
         stop = {3: lambda: signal.raise_signal(signal.SIGTERM)}
         assert saved(at=stop, error=Interrupted, checkpoint_frames=30) == [30]
         assert saved(total_frames=90, checkpoint_frames=30) == [30, 60, 90]
 
     @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-    def test_not_after_an_error_for_its_state_may_be_broken(self, saved, error):
+    def test_no_checkpoint_is_saved_after_an_error(self, saved, error):
         def fail():
             raise error
 
         assert saved(at={4: fail}, error=error, checkpoint_frames=20) == [20]
 
-    def test_nowhere_without_checkpoints(self, tmp_path, monkeypatch):
+    def test_training_works_without_checkpoints(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         make_trainer(total_frames=10).train()
         assert not list(tmp_path.iterdir())
@@ -303,7 +303,7 @@ def test_the_best_and_the_last_weights_are_kept(tmp_path):
 
 
 class TestStopRequests:
-    def test_one_between_two_updates_leaves_the_rest_owed(self, tmp_path):
+    def test_a_stop_between_two_updates_leaves_the_rest_owed(self, tmp_path):
         learner = CountingLearner(5)
         learn = learner.learn
 
@@ -324,7 +324,7 @@ class TestStopRequests:
         assert learner.told[6:13] == ["store", *["update"] * 5, "store"]
         assert [row["flat/updates"] for row in trainer.logger.rows] == [5 * count for count in range(11)]
 
-    def test_one_during_an_evaluation_ends_it_at_once(self, tmp_path):
+    def test_a_stop_during_an_evaluation_ends_it_at_once(self, tmp_path):
         def stopped_evaluation():
             signal.raise_signal(signal.SIGINT)
             raise AssertionError("it went on")
@@ -335,13 +335,13 @@ class TestStopRequests:
             trainer.train()
         assert stop.value.exit_code == 130 and not trainer.logger.rows
 
-    def test_signals_have_their_former_handlers_after_training(self):
+    def test_signal_handlers_are_restored_after_training(self):
         former = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
         make_trainer(total_frames=10).train()
         assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == former
 
 
-def test_its_clocks_stand_still_while_it_is_stopped(tmp_path, monkeypatch):
+def test_the_clocks_of_a_training_stand_still_while_it_is_stopped(tmp_path, monkeypatch):
     clock = [5.0]
     monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
 
@@ -392,7 +392,7 @@ class TestWholeRuns:
         assert first.frames == 256 and first.updates > 20  # a later trainer does not touch an earlier one
 
     @pytest.mark.parametrize("name", ["drqn", "v2"])
-    def test_what_a_row_holds(self, tmp_path, name):
+    def test_a_row_holds_the_columns_of_its_algorithm(self, tmp_path, name):
         trainer, rows, _ = train_really(tmp_path / "run", name)
         levels = list(trainer.algorithm.learners)
         per_level = ("loss", "td_error", "q_value", "target", "trained_steps", "updates", "epsilon")
@@ -426,7 +426,7 @@ class TestWholeRuns:
     ids=str,
 )
 def test_updates_wait_until_there_is_a_sequence_to_draw(name, learner, tmp_path):
-    """Warm-up is over with the first batch of eight steps; later nothing is made up for."""
+    """Warm-up ends with the first batch of eight steps; missed updates are not made up for later."""
     settings = {"warmup_frames": 0, "capacity": 100, "frames_per_update": 8}
     trainer = make_training(tmp_path, name, learner=settings | learner, total_frames=192, evaluation_frames=1000)
     trainer.train()

@@ -22,7 +22,7 @@ def train_a_little(algorithm, env):
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
-def test_networks_and_target_networks_are_the_others_and_all_else_is_new(name):
+def test_networks_and_target_networks_are_copied_and_all_else_is_new(name):
     torch.manual_seed(0)
     source, target = build(name, small_env(4)), build(name, small_env(2, max_steps=9))
     train_a_little(source, small_env(4))
@@ -46,7 +46,7 @@ def _live_name(loss):
     return name.removeprefix("target_")
 
 
-def test_other_shapes_are_refused_by_name_before_anything_is_copied():
+def test_weights_of_other_shapes_are_refused_by_name_before_anything_is_copied():
     source, target = build("v2", small_env(2), compact_network(16, (8,))), build("v2", small_env(2))
     before = {key: value.clone() for key, value in target.policy.state_dict().items()}
     with pytest.raises(
@@ -56,7 +56,7 @@ def test_other_shapes_are_refused_by_name_before_anything_is_copied():
     assert all((value == before[key]).all() for key, value in target.policy.state_dict().items())
 
 
-def test_another_algorithm_is_refused():
+def test_weights_of_another_algorithm_are_refused():
     with pytest.raises(ValueError, match=r"is missing there and .*; .* and \d+ more; use the algo and network"):
         start_from(build("v2", small_env(2)), build("v3", small_env(2)).policy.state_dict())
 
@@ -73,7 +73,7 @@ def run(tmp_path_factory):
 
 
 class TestFinding:
-    def test_the_best_the_last_one_by_name_and_a_file(self, run, tmp_path):
+    def test_initial_weights_are_found_as_best_last_by_name_or_in_a_file(self, run, tmp_path):
         folder, trainer = run
         steps = [int(find_weights(folder, which).name[-12:]) for which in ("best", "last")]
         assert steps == [96, 256]
@@ -86,7 +86,7 @@ class TestFinding:
             assert weights.keys() == expected.keys()
             assert all((value == expected[key]).all() for key, value in weights.items())
 
-    def test_what_is_none_of_these_is_refused(self, tmp_path):
+    def test_a_path_without_weights_is_refused(self, tmp_path):
         with pytest.raises(ValueError, match="init_from must be a run folder, a checkpoint or a weights file, got"):
             find_weights(tmp_path / "nothing")
         (tmp_path / "text").write_text("text")
@@ -94,11 +94,11 @@ class TestFinding:
             load_weights_of(tmp_path / "text")
 
     @pytest.mark.parametrize("place", ["/dev/null", "x" * 5000])
-    def test_a_device_or_a_name_that_cannot_be_looked_up_is_refused_as_a_setting(self, place):
+    def test_a_device_or_an_impossible_path_is_refused(self, place):
         with pytest.raises(ValueError, match=r"^init_from can't be read: "):
             find_weights(Path(place))
 
-    def test_damage_is_refused(self, run, tmp_path):
+    def test_damaged_weights_are_refused(self, run, tmp_path):
         folder, _ = run
         copy = shutil.copytree(find_weights(folder, "last"), tmp_path / "checkpoints" / "checkpoint-000000000256")
         (copy / "manifest.json").write_text("{}")

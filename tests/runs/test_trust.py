@@ -20,7 +20,7 @@ def settings():
 
 
 class TestCheckTargets:
-    def test_what_the_files_of_conf_name_is_allowed(self):
+    def test_builders_named_in_conf_are_allowed(self):
         groups = ("env", "algo", "network", "logger", "experiment")
         files = [file for group in groups for file in (Path(CONF) / group).glob("*.yaml")]
         named = {name for file in files for name in re.findall(r"_target_: (\S+)", file.read_text())}
@@ -42,14 +42,14 @@ class TestCheckTargets:
             ("network._target_", None, "network._target_"),
         ],
     )
-    def test_all_others_are_refused_by_their_place(self, settings, key, value, path):
+    def test_other_builders_are_refused_by_their_path(self, settings, key, value, path):
         OmegaConf.update(settings, key, value, merge=False, force_add=True)
         with pytest.raises(
             SettingsError, match=f"^{re.escape(path)} must be one of the builders that .* trusts there, got "
         ):
             check_targets(plain(settings), [])
 
-    def test_ones_own_builders_can_be_added(self, settings):
+    def test_a_users_builders_can_be_added(self, settings):
         settings.env._target_ = "my_package.MyEnv"
         with pytest.raises(SettingsError, match=r"add 'allowed_targets=\[my_package\.MyEnv\]' to the command"):
             check_targets(plain(settings), ["my_package.Other"])

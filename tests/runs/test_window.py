@@ -22,13 +22,13 @@ def test_a_log_point_averages_episodes_and_updates():
     assert (row["behaviour/return"], row["meta/loss"]) == (3.0, 2.0)
 
 
-def test_without_episodes_there_is_no_column_of_them():
+def test_without_episodes_there_are_no_columns_of_episodes():
     window = Window()
     window.add_episodes(episodes([]))
     assert set(window.summary(10)) == {"frames_per_second"}
 
 
-def test_a_restored_window_goes_on_where_the_other_was():
+def test_a_restored_window_continues_where_the_other_was():
     window, other = Window(frames=50), Window()
     window.add_episodes(episodes([1.0]))
     window.add_update("sub", {"loss": torch.tensor(4.0)})

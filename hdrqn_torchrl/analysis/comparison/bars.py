@@ -32,7 +32,7 @@ from hdrqn_torchrl.analysis.comparison.panels import (
 from hdrqn_torchrl.analysis.estimates import Center, Estimate, Group, TaskResults
 
 _HATCH = "////"
-_MANY = 8  # bars; more of them lie on their side, with their names once at the left
+_MANY = 8  # bars; if there are more they are horizontal, with their names once at the left
 
 
 def plot_bars(

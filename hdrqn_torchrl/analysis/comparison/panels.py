@@ -49,7 +49,7 @@ _QUANTITIES = {  # by the last part of a column's name
 }
 _REFERENCE_KEYS = {"return": "return_mean", "steps": "steps_mean", "success": "success_rate"}
 
-# Okabe and Ito's palette: told apart by colour-blind readers, too. Its yellow is too light for lines.
+# Okabe and Ito's palette, which colour-blind readers can tell apart. Its yellow is too light for lines.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _MARKERS = ("o", "s", "^", "D", "v", "p", "<", ">", "h")
 _PLAYERS: dict[str, tuple[str, Any]] = {  # line style and name of the scripted players
@@ -118,7 +118,7 @@ def styles_of(tasks: Sequence[TaskResults]) -> dict[str, tuple[str, str]]:
 
 
 def reached(line: Estimate) -> NDArray[np.bool_]:
-    """Where all runs that have values at all have reached."""
+    """The positions that all runs with any values have reached."""
     return line.runs == np.isfinite(line.samples).any(1).sum()
 
 
@@ -203,7 +203,7 @@ def caption_of(tasks: Sequence[TaskResults], center: Center) -> str:
 
 
 def as_text(label: str) -> str:
-    """A label from a run's settings as it stands: no mathematics, and not longer than a line.
+    """A label from a run's settings as plain text: no mathematics, and not longer than a line.
 
     Examples:
         >>> as_text("a$b")
@@ -235,7 +235,7 @@ def add_legend(figure: Figure, handles: list[Any], explained: list[Any], caption
 
 
 def _width(handles: list[Any], rows: int) -> float:
-    """Inches that legend entries need in so many rows, at 8 points."""
+    """Height in inches of a legend with this number of rows, at 8 points."""
     longest = max((len(handle.get_label()) for handle in handles), default=0)
     return -(-len(handles) // rows) * (0.062 * longest + 0.55)
 

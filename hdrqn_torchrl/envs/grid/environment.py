@@ -34,7 +34,7 @@ class MultiGoalGridEnv(EnvBase):
     **Reward.** ``reward``: -1 on an obstacle, +1 for each goal in order, 0.01 for a goal out of order.
     ``extrinsic_reward``: the same without the obstacle's penalty. Besides these: ``attained`` ``[K]`` (goals
     reached by this step), ``hazard`` (obstacle hit), ``success`` (last goal reached, all in order).
-    With ``places`` there are nearer subgoals, too: ``rooms_attained`` ``[N, places]`` (the room or door entered by this
+    With ``places`` there are also nearer subgoals: ``rooms_attained`` ``[N, places]`` (the room or door entered by this
     step) and ``rooms_available`` (all but the one where the agent is); ``task.subgoals`` has their names.
 
     **End of episode.** All goals collected: terminated. ``max_steps`` steps: truncated.
@@ -197,7 +197,7 @@ class MultiGoalGridEnv(EnvBase):
         return self._outcome(before, events)
 
     def _places(self, before: Tensor) -> dict[str, Tensor]:
-        """What is told of rooms and doors after a step from the cells ``before``, where they are subgoals."""
+        """Entries of rooms and doors after a step from the cells ``before``, where they are subgoals."""
         places, agent = self.rules.places, self.state.agent
         if places is None:
             return {}
@@ -216,7 +216,7 @@ class MultiGoalGridEnv(EnvBase):
                 over that it has taken the tensors out of.)
 
         Raises:
-            ValueError: if it is the state of another number of worlds, or of worlds that can't be.
+            ValueError: if it is the state of another number of worlds, or of impossible worlds.
         """
         if not strict and "steps" not in state_dict:
             return

@@ -1,4 +1,4 @@
-"""What the scripted players achieve on the paper's tasks; ``python benchmarks/ceilings.py`` measures it anew."""
+"""What the scripted players achieve on the paper's tasks; ``python benchmarks/ceilings.py`` measures it again."""
 
 from __future__ import annotations
 

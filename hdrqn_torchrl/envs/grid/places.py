@@ -1,4 +1,4 @@
-"""Rooms and doors of a map: nearer subgoals than the goals, and where goals are put apart from the agent."""
+"""Rooms and doors of a map: subgoals nearer than the goals, and goals placed in other rooms than the agent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Places:
 
     Attributes:
         names: ``"room 1"``, ..., then ``"door 1-2"``, ...
-        num_rooms: how many of them are rooms.
+        num_rooms: the number of rooms among them.
         of_cell: the place that each cell belongs to, ``[cells]`` int64; walls belong to none and have ``len(names)``.
     """
 

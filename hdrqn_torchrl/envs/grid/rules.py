@@ -57,7 +57,7 @@ class GridRules:
             map, still centred on the agent.
         obstacle: ``"stay"`` leaves a hit obstacle where it is, ``"teleport"`` moves it to a random free cell
             (as the authors' script does).
-        num_obstacles: how many obstacles stand in the map.
+        num_obstacles: number of obstacles.
         places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
         device: where the tables live.
 

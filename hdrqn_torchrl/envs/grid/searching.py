@@ -25,7 +25,7 @@ class PerfectMemorySearch:
 
     What it may use: the windows seen in this episode, its own position, the map's walls, and which goals its steps
     reached. Objects that it has not seen do not influence it. To search, it weighs how much a cell would show against
-    the way there; an unseen cell counts up to double when its neighbours are seen, so that no crumbs are left behind.
+    the way there; an unseen cell counts up to double when its neighbours are seen, so that no single cells stay unseen.
 
     Args:
         env: the environment it plays; a new episode is recognised by ``env.steps == 0``.
@@ -52,12 +52,12 @@ class PerfectMemorySearch:
 
 
 class EgocentricSearch:
-    """Like :class:`PerfectMemorySearch`, but it is not told where it starts: it knows what a learning agent can know.
+    """Like :class:`PerfectMemorySearch`, but without knowing where it starts: it knows what a learning agent can know.
 
     What it may use: the windows seen in this episode, its own actions, whether they moved it (windows of 3 cells and
     more show that, too), the map's walls, and which goals its steps reached. It draws a map around its start, and keeps
     all start cells that fit what it saw of walls and floor. They are equally likely: objects stand anywhere, so what it
-    saw of them speaks for none. To search, it weighs how much it *expects* to see. A cell counts more where its unseen
+    saw of them favours none. To search, it weighs how much it *expects* to see. A cell counts more where its unseen
     neighbours may be walls, because it shows on which side there is more room.
 
     Measured in the open map, the first sight of a goal takes as long as with one step of policy improvement by
@@ -153,7 +153,7 @@ class _Memory:
         return self._unseen[:, :-1]
 
     def forget(self, worlds: Tensor) -> None:
-        """Begins anew in ``worlds`` ``[N]`` bool."""
+        """Starts again in ``worlds`` ``[N]`` bool."""
         self._codes[worlds] = torch.where(self._walls, WALL, FLOOR).to(torch.uint8)
         self._unseen[worlds] = (~self._walls).float()
         self.collected[worlds], self.in_order[worlds] = False, True
@@ -175,7 +175,7 @@ class _Memory:
         return _in_window(_in_window(self._map(weight), self._view // 2), self._view // 2).flatten(1)
 
     def beside(self, weight: Tensor) -> Tensor:
-        """A fourth of the sum of ``weight`` ``[N, cells]`` over the neighbours of each cell; walls must have none."""
+        """A quarter of the sum of ``weight`` ``[N, cells]`` over the neighbours of each cell; walls must have none."""
         around = pad(self._map(weight), (1, 1, 1, 1))
         rows, columns = around[:, :, 1:-1], around[:, 1:-1]
         return ((columns[..., :-2] + columns[..., 2:] + rows[:, :-2] + rows[:, 2:]) / len(ACTIONS)).flatten(1)
@@ -185,7 +185,7 @@ class _Memory:
 
 
 def _in_window(weight: Tensor, radius: int) -> Tensor:
-    """Sum over each line from ``radius`` cells before a cell to as many behind it; lines and columns change places."""
+    """Sum over each line from ``radius`` cells before to ``radius`` behind a cell; lines and columns change places."""
     length = weight.shape[-1]
     total = weight.clone()
     for far in range(1, min(radius, length - 1) + 1):

@@ -1,4 +1,4 @@
-"""What the grid tasks tell about themselves."""
+"""What the grid tasks state about themselves."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def grid_task(rules: GridRules, settings: Mapping[str, Any]) -> Task:
 
 
 def subgoals_of(rules: GridRules) -> tuple[SubgoalSet, ...]:
-    """The sets of subgoals of a grid task, from near to far: rooms and doors if they are any, and the goals."""
+    """The sets of subgoals of a grid task, from near to far: rooms and doors if they are subgoals, then the goals."""
     goals = SubgoalSet(names=tuple(f"goal {index + 1}" for index in range(rules.num_goals)))
     if rules.places is None:
         return (goals,)

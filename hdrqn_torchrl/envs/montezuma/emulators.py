@@ -1,4 +1,4 @@
-"""Atari emulators stepped side by side, with nothing between them and numpy arrays."""
+"""Atari emulators stepped side by side, writing straight into numpy arrays."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Snapshot(NamedTuple):
         """What :meth:`tensors` was called on.
 
         Raises:
-            ValueError: if it can't be that.
+            ValueError: if they are not the tensors of an emulator.
         """
         shapes = {name: tuple(tensors[name].shape) for name in cls._fields}
         only_bytes = all(tensors[name].dtype == torch.uint8 for name in cls._fields)
@@ -57,7 +57,7 @@ class Emulators:
         number: N.
         frame_skip: frames that an action lasts.
         sticky: probability that a frame repeats the previous action instead.
-        threads: threads that step the emulators, each its share of them; ale-py lets go of Python's lock meanwhile.
+        threads: threads that step the emulators, each its share of them; ale-py releases Python's lock meanwhile.
 
     Raises:
         ImportError: if ale-py is missing.
@@ -98,7 +98,7 @@ class Emulators:
         return len(self._emulators)
 
     def seed(self, seed: int) -> None:
-        """Seeds the sticky actions, which each emulator draws from a generator of its own; games begin anew then."""
+        """Seeds the sticky actions, which each emulator draws from a generator of its own; games start again then."""
         if not self._sticky:
             return  # nothing else is drawn, and loading takes a tenth of a second each
         own = np.random.SeedSequence(seed).generate_state(len(self)) >> 1  # 31 bits
@@ -112,7 +112,7 @@ class Emulators:
         return self.save(0)
 
     def act(self, actions: Sequence[int]) -> NDArray[np.float32]:
-        """One action in each emulator; returns what the scores rose by, ``[N]``."""
+        """One action in each emulator; returns the increases of the scores, ``[N]``."""
         rewards = np.zeros(len(self), np.float32)
 
         def play(share: range) -> None:
@@ -130,7 +130,7 @@ class Emulators:
             list(self._pool.map(work, self._shares))  # the list raises what a thread raised
 
     def act_alone(self, index: int, action: int, times: int = 1) -> float:
-        """The same action some times in one emulator; returns what its score rose by."""
+        """Repeats an action in one emulator; returns the increase of its score."""
         reward = 0.0
         for _ in range(times):
             reward += self._emulators[index].act(action)

@@ -37,7 +37,7 @@ class MontezumaEnv(EnvBase):
     **Observation.** ``pixels`` ``[210, 160, 3]`` uint8, the native screen, and ``position`` ``[2]`` (x to the right, y
     down, in pixels), the agent's centre. :func:`~hdrqn_torchrl.envs.make_montezuma` makes the agent's window of them.
 
-    **Reward.** ``reward``: what the score rose by. ``extrinsic_reward``: 1 for the key and 1 for a door. Besides these:
+    **Reward.** ``reward``: increase of the score. ``extrinsic_reward``: 1 for the key and 1 for a door. Besides these:
     ``attained`` ``[G]`` (the agent came into a subgoal's box in this step, alive and not falling; took the key; opened
     the door; at a reset: it begins there), ``available`` ``[G]`` (subgoals worth choosing: not where the agent is, but
     for a door that it has the key for; not the key once it is taken), ``hazard`` (the agent died in this step),
@@ -62,7 +62,7 @@ class MontezumaEnv(EnvBase):
             without sticky actions) the game is deterministic.
         practice: share of episodes that do not begin at the start but at a subgoal that was attained before, drawn
             among those. (Not in the paper.)
-        practice_steps: steps of all emulators together after which there is no more practice; ``None``: never.
+        practice_steps: steps of all emulators together after which practice ends; ``None``: never.
         threads: that step the emulators.
         seed: of no-ops, practice and sticky actions; ``None`` draws one from torch's global generator.
         device: device of all tensors.

@@ -1,4 +1,4 @@
-"""Facts of the first screen of Montezuma's Revenge: where its places are, and what the bytes of the RAM say."""
+"""Facts of the first screen of Montezuma's Revenge: where its places are, and what the bytes of the RAM mean."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Ram:
     """What the RAM of N emulators says, ``[N]`` each.
 
     Args:
-        ram: its bytes ``[N, 128]``, read anew with each call.
+        ram: its bytes ``[N, 128]``, read again at each call.
     """
 
     def __init__(self, ram: NDArray[np.uint8]) -> None:

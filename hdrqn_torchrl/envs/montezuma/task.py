@@ -1,4 +1,4 @@
-"""What Montezuma's Revenge tells about itself."""
+"""What Montezuma's Revenge states about itself."""
 
 from __future__ import annotations
 
