@@ -42,7 +42,7 @@ def python_blocks(page: Path) -> list[str]:
 
 
 def commands(page: Path) -> list[str]:
-    """Command lines in shell blocks, and those that stand in a sentence."""
+    """Command lines in shell blocks, and those in running text."""
     text = page.read_text()
     lines = "\n".join(re.findall(r"```bash\n(.*?)```", text, flags=re.S)).splitlines()
     quoted = re.findall(r"(?<!`)`((?:python |hdrqn |make )[^`\n]+)`(?!`)", text)
@@ -79,7 +79,7 @@ def jobs(arguments: list[str]) -> list[list[str]]:
 
 @cache
 def check_training(overrides: tuple[str, ...], folder: str | None = None) -> None:
-    """Composes settings, with those of a folder of one's own, and checks their rules."""
+    """Composes settings, with those of a user's folder, and checks their rules."""
     composed([*overrides, *([] if folder is None else ["--config-dir", str(ROOT / folder)])])
 
 

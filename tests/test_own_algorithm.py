@@ -1,4 +1,4 @@
-"""An algorithm of one's own takes a builder and a file of settings, and trains like those of the package."""
+"""A user's algorithm takes a builder and a file of settings, and trains like those of the package."""
 
 from __future__ import annotations
 

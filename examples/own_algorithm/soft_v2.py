@@ -1,4 +1,4 @@
-"""An algorithm of your own: hDRQNv2 whose exploration prefers what is worth more.
+"""An algorithm of your own: hDRQNv2 whose exploration prefers higher values.
 
 Three files: this builder, what differs in ``algo/soft_v2.yaml``, and a test (``tests/test_own_algorithm.py``). Nothing
 of the package is changed. From the top of a checkout::

@@ -54,8 +54,8 @@ def make_hdrqn(
     r"""Hierarchical deep recurrent Q-learning (Algorithm 1), with any number of levels.
 
     The paper has two. With more, each middle level chooses among a nearer set of subgoals of the task
-    (:class:`~hdrqn_torchrl.envs.SubgoalSet`): it is told which subgoal the level above pursues, is paid that level's
-    intrinsic reward, summed along its own options, and its memory begins anew where that level chooses.
+    (:class:`~hdrqn_torchrl.envs.SubgoalSet`): it knows which subgoal the level above pursues, is paid that level's
+    intrinsic reward, summed along its own options, and its memory restarts where that level chooses.
 
     Args:
         env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``,
@@ -79,7 +79,7 @@ def make_hdrqn(
         meta_input: which part of the LSTM state v2 reads.
         meta_input_time: whether that state includes the observation in which the last option ended.
         refresh_hidden_steps: v2's states in the meta replay grow stale as the sub-controller learns. Given a number of
-            steps, they are computed anew from the stored observations after options of up to so many steps (the step
+            steps, they are recomputed from the stored observations after options of up to this many steps (the step
             limit of an episode covers all). ``None`` keeps them as stored, like the paper.
         mask_reached: let the meta-controller choose only among subgoals not yet attained.
         repeatable_subgoals: whether the farthest subgoals can be attained again (then nothing is masked); ``None``: as
@@ -199,7 +199,7 @@ def _check_levels(levels: int, meta_hindsight: bool, meta_input_time: str) -> No
         raise ValueError(f"levels must be >= 2, got {levels}; use make_drqn for a flat agent.")
     if levels > 2 and meta_hindsight:
         raise ValueError(
-            f"meta_hindsight must be False with levels={levels}, got True: an option that is told differently would "
+            f"meta_hindsight must be False with levels={levels}, got True: an option that is relabelled would "
             "begin in the middle of another level's; use levels=2, or sub_hindsight."
         )
     if levels > 2 and meta_input_time == "after_last_observation":
@@ -218,7 +218,7 @@ def _check_hindsight(sub: LearnerSettings, meta: LearnerSettings, sub_hindsight:
     if sub_hindsight and sub.priority_exponent is not None:
         raise ValueError(
             f"sub.priority_exponent must be None with sub_hindsight=True, got {sub.priority_exponent}: a sequence has "
-            "an error for every subgoal it is told for, and one priority."
+            "an error for every subgoal it is relabelled for, and one priority."
         )
     for level, settings, hindsight in (("sub", sub, sub_hindsight), ("meta", meta, meta_hindsight)):
         if settings.stored_state and hindsight:

@@ -29,7 +29,7 @@ SUB_LEARNER = LearnerSettings()
 META_LEARNER = LearnerSettings(slice_len=1, capacity=50_000, frames_per_update=16)
 """The meta level's, of hDRQNv2 and hDQN: single options."""
 V1_META_LEARNER = replace(META_LEARNER, slice_len=2)
-"""The meta level's, of hDRQNv1: an observation does not tell how many goals are left, but two options in a row do."""
+"""The meta level's, of hDRQNv1: an observation does not show how many goals are left, but two options in a row do."""
 HDQN_SUB_LEARNER = LearnerSettings(slice_len=1, batch_size=128)
 """The sub level's, of hDQN: single steps."""
 

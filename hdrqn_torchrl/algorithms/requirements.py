@@ -33,8 +33,8 @@ class Requirements:
         observation: spec of the observation ``[N, ...]``.
         num_actions: number of actions.
         subgoals: the sets of subgoals that the agent pursues, from near to far; empty for a flat agent.
-        available_keys: for each set, the entry that tells which subgoals are worth choosing, or ``None``.
-        hazard_key: the entry that tells of the hazard; ``None`` if the environment or the agent has none.
+        available_keys: for each set, the entry that marks the subgoals worth choosing, or ``None``.
+        hazard_key: the entry that marks the hazard; ``None`` if the environment or the agent has none.
         task: what the environment states about itself.
     """
 
@@ -53,7 +53,7 @@ class Requirements:
 
     @property
     def available_key(self) -> NestedKey | None:
-        """The farthest set's entry that tells which subgoals are worth choosing, if there is one."""
+        """The farthest set's entry that marks the subgoals worth choosing, if there is one."""
         return self.available_keys[-1] if self.available_keys else None
 
     @property

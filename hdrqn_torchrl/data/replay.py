@@ -82,8 +82,8 @@ def make_sequence_buffer(
 ) -> SequenceBuffer:
     """A TorchRL replay buffer from which random slices of episodes are drawn ("bootstrapped random updates").
 
-    Trajectories shorter than ``slice_len`` are not dropped: they are padded and ``("collector", "mask")`` tells
-    which steps are real.
+    Trajectories shorter than ``slice_len`` are not dropped: they are padded and ``("collector", "mask")`` marks
+    the real steps.
 
     Args:
         capacity: number of transitions kept, rounded up to the same number for each environment.

@@ -19,7 +19,7 @@ class StepSliceSampler(SliceSampler):
     How long an episode lasts depends on what happened in it. To pick episodes uniformly shows each step of a
     short (say, successful) episode more often than it occurs, and shows its last steps less often than those in
     its middle; Q-values of a stochastic task are then biased. Here whether a step is shown depends on its past
-    only. A slice that meets the end of its episode is padded and ``("collector", "mask")`` tells its real steps.
+    only. A slice that meets the end of its episode is padded and ``("collector", "mask")`` marks its real steps.
 
     Args:
         slice_len: steps of a slice.

@@ -76,14 +76,14 @@ class Task:
             there is one set, whose size is that of ``attained``.
         ordered: whether the farthest subgoals are to be attained one after the other, as they are numbered. Then the
             share of them that were is counted, as ``in_order``.
-        success: entry that tells whether a step completed the whole task, if the environment writes it.
+        success: entry that says whether a step completed the whole task, if the environment writes it.
         actions: names of the actions.
         references: scripted players by name.
         ceiling: name of the one that learning curves are drawn against.
         scene: makes a picture of the present moment; ``None``: what the environment's ``render`` returns or, failing
             that, text.
         screen: a picture ``[height, width, 3]`` of where an episode begins, for environments whose entry ``position``
-            tells where on it the agent is.
+            gives the agent's place on it.
 
     Raises:
         ValueError: if an argument breaks its rule.

@@ -149,8 +149,8 @@ class MetaController(TensorDictModuleBase):
     ``input_keys=["observation"]``) or the state of the level below at the end of the last option (v2,
     ``input_keys=["sub_hidden"]``, ``["sub_cell"]`` or both).
 
-    Below another level that chooses subgoals, it is told which one is pursued (``condition_key``), and its state
-    restarts from zero where that level chose anew (``init_key``).
+    Below another level that chooses subgoals, it reads which one is pursued (``condition_key``), and its state
+    restarts from zero where that level chose another (``init_key``).
 
     Args:
         network: Q-network over subgoals, with ``num_conditions`` = number of subgoals of the level above; 0 at the top.
@@ -209,7 +209,7 @@ class MetaController(TensorDictModuleBase):
             raise ValueError(
                 f"condition_key and init_key must be None exactly when the network has no condition, got "
                 f"condition_key={condition_key!r}, init_key={init_key!r} and num_conditions={network.num_conditions}; "
-                "only below another level that chooses subgoals there is one to be told."
+                "only below another level that chooses subgoals there is one to read."
             )
         self.network, self.exploration = network, exploration_or_greedy(exploration, "exploration")
         if condition_key is None:

@@ -43,7 +43,7 @@ class EpsilonGreedy(nn.Module):
         >>> exploration(torch.tensor([[0.0, 2.0, 1.0]]))
         (tensor([1]), None)
 
-        An exploration of one's own: random choices prefer what is worth more.
+        A custom exploration: random choices prefer higher values.
 
         >>> class SoftmaxEpsilonGreedy(EpsilonGreedy):
         ...     def random_choice(self, values, mask):
@@ -98,7 +98,7 @@ class EpsilonGreedy(nn.Module):
 
         Args:
             num_subgoals: G.
-            names: of the entries that tell what became of them.
+            names: of the entries that hold their outcome.
         """
 
     def observe(self, batch: TensorDictBase) -> None:

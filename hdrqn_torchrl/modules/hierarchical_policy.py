@@ -85,7 +85,7 @@ def _all_meta(controllers: Sequence[TensorDictModuleBase]) -> bool:
 
 
 def _check_fit(upper: TensorDictModuleBase, lower: TensorDictModuleBase) -> None:
-    """Refuses a level that is not told what the one above it chooses."""
+    """Refuses a level that does not read what the one above it chooses."""
     chosen, known = upper.network.num_actions, lower.network.num_conditions
     if chosen != known:
         name = "sub_controller" if isinstance(lower, SubController) else "a controller"

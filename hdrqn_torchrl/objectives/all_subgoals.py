@@ -84,7 +84,7 @@ class AllSubgoalsLoss(SequenceLoss):
         stored_state: whether sequences start, in both networks, from the LSTM state that acting had at their first
             step; from zero at the start of an episode.
         prediction_weight: weight of the error of the network's predictor, if it has one. The number of steps that it
-            looks ahead is drawn anew for every minibatch.
+            looks ahead is drawn again for every minibatch.
 
     Raises:
         ValueError: if an argument breaks its rule.

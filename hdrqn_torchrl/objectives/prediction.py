@@ -17,7 +17,7 @@ def prediction_loss(
     valid: Tensor,
     cut: Tensor,
 ) -> Tensor:
-    """Mean error of the predictor some steps ahead; the number of steps is drawn anew at each call.
+    """Mean error of the predictor some steps ahead; the number of steps is drawn at each call.
 
     Args:
         predictor: the predictor.

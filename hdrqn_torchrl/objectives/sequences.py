@@ -127,7 +127,7 @@ def _flag(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
 
 
 def _padding(valid: Tensor) -> Tensor | None:
-    """What is not valid; ``None`` if that is nothing, as far as a host can tell."""
+    """The steps that are not valid; ``None`` if the host knows that there are none."""
     return None if on_host(valid) and bool(valid.all()) else ~valid
 
 

@@ -116,7 +116,7 @@ def target_lookahead(trace_decay: float, n_step: int, slice_len: int) -> int:
     r"""Steps that should follow a sequence of ``slice_len`` trained ones, so that no target is cut short by its end.
 
     An n-step target takes n - 1 of them. A target of Q(lambda) reaches over all that there are, with weights that fade;
-    it takes :math:`\lambda / (1 - \lambda)` on average, and so many are drawn, but no more than ``slice_len``.
+    it takes :math:`\lambda / (1 - \lambda)` on average, which is the number drawn, but no more than ``slice_len``.
 
     Args:
         trace_decay: lambda.

@@ -86,7 +86,7 @@ class EpisodeTracker:
     proper order, where the task has one).
 
     Args:
-        task: says whether subgoals have an order, and which entry tells success.
+        task: says whether subgoals have an order, and which entry marks success.
         per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
             attained, options for it that ended, and those of them that reached it.
     """

@@ -47,7 +47,7 @@ def lock(path: Path, *, patience_seconds: float = 0.0, tell: Callable[[str], Non
     Args:
         path: a file for the lock; its folder must exist. The file stays, and names its last owner.
         patience_seconds: how long to wait for another process.
-        tell: called once, with the words for who is waited for.
+        tell: called once, with the name of the process that holds it.
 
     Raises:
         InUse: if another process holds it all that time.

@@ -20,7 +20,7 @@ def results(**groups):
         ([1.0, 1.8], [0.1, 0.9], "open"),  # resampled means of two seeds never overlap here
     ],
 )
-def test_order_of_two(a, b, outcome):
+def test_an_order_of_two_groups_is_decided_by_their_difference(a, b, outcome):
     assert Ordered("return", ["a", "b"]).check(results(a=a, b=b)).outcome == outcome
 
 
@@ -31,7 +31,7 @@ def test_groups_of_one_level_are_not_compared():
     assert Ordered("return", ["c", ["b", "a"]]).check(values).claim == "c above b and a"
 
 
-def test_an_order_of_many_needs_every_pair_and_is_refuted_by_one_that_is_sure_among_all():
+def test_an_order_of_many_needs_every_pair_and_is_refuted_by_one_after_bonferroni():
     """Welch's two-sided level of the pair is 0.03: below 0.05 for one pair, not below 0.05 / 2 for one of two."""
     low, high = np.array([1.0, 1.1, 1.2]), np.array([1.25, 1.35, 1.45])
     alone = results(a=low, b=high)
@@ -52,7 +52,7 @@ def test_an_order_of_many_needs_every_pair_and_is_refuted_by_one_that_is_sure_am
         ([0.5, 1.5], [0.8, 0.8], "open"),
     ],
 )
-def test_alike(a, b, outcome):
+def test_two_groups_are_alike_if_the_interval_of_their_difference_lies_within(a, b, outcome):
     assert Alike("return", ["a", "b"]).check(results(a=a, b=b)).outcome == outcome
 
 
@@ -60,7 +60,7 @@ def test_alike(a, b, outcome):
     ("values", "outcome"),
     [([1.2, 1.21], "agrees"), ([1.9, 1.91], "disagrees"), ([1.2, 1.4], "open"), ([1.9, 1.5], "open")],
 )
-def test_near(values, outcome):
+def test_a_mean_is_near_a_value_if_its_interval_lies_within(values, outcome):
     verdict = Near("return", "a", 1.0, within=0.5).check(results(a=values))
     assert (verdict.outcome, verdict.claim) == (outcome, "a takes 1 return (within 0.5)")
 
@@ -75,7 +75,7 @@ def test_near(values, outcome):
     ],
     ids=str,
 )
-def test_one_seed_decides_nothing_and_is_said(claim):
+def test_one_seed_decides_nothing_and_the_verdict_says_so(claim):
     assert claim.check(results(a=[2.0, 2.1], b=[1.0])).outcome == "open (one seed)"
 
 
@@ -85,7 +85,7 @@ def test_seeds_that_are_all_equal_decide_nothing():
         assert claim.check(values).outcome == "open"
 
 
-def test_what_was_measured_has_the_reach_of_its_interval():
+def test_a_measured_mean_comes_with_the_half_width_of_its_interval():
     verdict = Ordered("return", ["a", "b"]).check(results(a=[1.0, 2.0, 3.0], b=[0.5]))
     assert verdict.measured == "a 2 ± 2.48, b 0.5"
 

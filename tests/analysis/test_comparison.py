@@ -104,7 +104,7 @@ def test_the_papers_curves_have_greedy_evaluations_as_points(tmp_path, figures):
     assert {"greedy evaluation", "while training, with exploration"} <= set(legend_of(figures[0]))
 
 
-def test_an_estimate_outside_of_its_interval_can_be_drawn(tmp_path, figures):
+def test_an_estimate_outside_its_interval_can_be_drawn(tmp_path, figures):
     """An interquartile mean may be, and matplotlib refuses error bars of negative length."""
     x = np.zeros(1)
     skewed = Estimate(x, value=x + 5, low=x + 1, high=x + 4, runs=np.array([4]), samples=np.full((4, 1), 5.0))
@@ -178,7 +178,7 @@ def test_shares_are_percentages_and_frames_have_prefixes(tmp_path, figures):
     assert axis.xaxis.get_major_formatter()(200_000) == "200k"
 
 
-def test_a_logarithmic_axis(tmp_path, figures):
+def test_the_axis_can_be_logarithmic(tmp_path, figures):
     plot_curves(one_task(group("v2", [run_of()])), [tmp_path / "a.png"], log_x=True)
     assert {axis.get_xscale() for axis in figures[0].axes} == {"log"}
 
@@ -207,7 +207,7 @@ def test_finished_runs_need_no_explanation(tmp_path, figures):
     assert legend_of(figures[0]) == ["v1 (1 seed)", "finished run"]
 
 
-def test_many_bars_lie_on_their_side_with_their_names_once(tmp_path, figures):
+def test_many_bars_are_horizontal_with_their_names_once(tmp_path, figures):
     groups = [Group(f"g{i}", [run_of(i), run_of(i + 1)], finals("", [run_of(i), run_of(i + 1)]).estimates, MEMORY)
               for i in range(9)]  # fmt: skip
     plot_bars(one_task(*groups), [tmp_path / "a.png"], panels=GREEDY[:2])

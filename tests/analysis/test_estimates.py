@@ -55,7 +55,7 @@ class TestEstimate:
     def at_one_position(self, values, **options):
         return estimate(np.zeros(1), np.array(values, float)[:, None], **options)
 
-    def test_center(self):
+    def test_the_center_is_the_mean_or_the_interquartile_mean(self):
         values = np.array([-100.0, 1, 2, 3, 4, 5, 6, 1000])
         assert center_of(values, "iqm") == 3.5  # a quarter of 8 is cut off at either end
         assert center_of(values, "mean") == values.mean()
@@ -92,7 +92,7 @@ class TestEstimate:
         assert wide.low < narrow.low < narrow.high < wide.high
 
     @pytest.mark.parametrize("center", ["mean", "iqm"])
-    def test_strata_may_differ_and_only_runs_of_one_stratum_widen_the_interval(self, center):
+    def test_only_differences_within_a_stratum_widen_the_interval(self, center):
         values, strata = [0, 0.1, 0.2, 10, 10.1, 10.2], ["a", "a", "a", "b", "b", "b"]
         within, mixed = (
             self.at_one_position(values, strata=strata, center=center),
@@ -112,18 +112,18 @@ class TestEstimate:
         assert each.runs.tolist() == [3, 3, 2, 1]
         assert np.isfinite(each.low).tolist() == [True, True, True, False]
 
-    def test_half_of_every_stratum_must_reach(self):
+    def test_a_position_needs_half_of_every_stratum(self):
         values = np.array([[0, 1], [0, 1], [0, 1], [5, NAN]])
         together = estimate(np.arange(2.0), values)
         apart = estimate(np.arange(2.0), values, strata=["a", "a", "a", "b"])
         assert together.value[1] == 1 and np.isnan(apart.value[1])
 
-    def test_runs_without_any_value_do_not_count(self):
+    def test_runs_without_any_value_are_ignored(self):
         each = estimate(np.arange(2.0), np.array([[1, 2], [NAN, NAN], [NAN, NAN]]))
         assert each.value.tolist() == [1, 2]
 
-    def test_groups_of_positions_are_kept_apart(self):
-        """Positions with the same runs are resampled together; each must get its own result."""
+    def test_positions_with_different_runs_are_estimated_separately(self):
+        """Positions with the same runs are computed together; each must get its own result."""
         values = np.array([[1, 10, NAN, 100], [3, NAN, 20, 300], [5, 30, NAN, 500]])
         each = estimate(np.arange(4.0), values)
         assert each.value == pytest.approx([3, 20, NAN, 300], nan_ok=True)

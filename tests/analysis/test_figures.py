@@ -5,7 +5,7 @@ from hdrqn_torchrl.analysis.figures import plot_legs, plot_legs_over_time, plot_
 from hdrqn_torchrl.analysis.results import Run
 
 
-def test_legs(tmp_path, figures):
+def test_legs_are_drawn_as_shares_and_counts(tmp_path, figures):
     options, reached = np.array([[0, 4], [1, 0], [2, 0]]), np.array([[0, 3], [0, 0], [2, 0]])
     plot_legs(options, reached, ["key", "door"], tmp_path / "legs.png")
     axis, _ = figures[0].axes
@@ -16,7 +16,7 @@ def test_legs(tmp_path, figures):
     assert (tmp_path / "legs.png").stat().st_size > 1000
 
 
-def test_legs_over_time(tmp_path, figures):
+def test_legs_over_time_are_means_over_log_points(tmp_path, figures):
     """Each part of a run has the mean over its log points, without those that had no such option."""
     nan = float("nan")
     metrics = {f"legs/{place}_to_{goal}": np.full(4, nan) for place in (0, 1, "start") for goal in (0, 1)}
@@ -32,7 +32,7 @@ def test_legs_over_time(tmp_path, figures):
         )
 
 
-def test_places(tmp_path, figures):
+def test_places_are_drawn_over_the_screen(tmp_path, figures):
     counts = np.zeros((105, 80), np.int64)
     counts[3, 4] = 7
     plot_places(counts, np.zeros((210, 160, 3), np.uint8), tmp_path / "places.png")

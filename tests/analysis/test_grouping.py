@@ -44,7 +44,7 @@ class TestGroups:
     def test_no_keys_put_all_runs_together(self):
         assert labels([entry(), entry()]) == {"gridworld": ["all"]}
 
-    def test_each_run_alone_is_called_by_what_tells_it_apart(self):
+    def test_single_runs_are_named_by_the_distinct_part_of_their_folders(self):
         assert labels([entry("sweep/0-dqn"), entry("sweep/1-v2")], "run") == {"gridworld": ["0-dqn", "1-v2"]}
         assert labels([entry("a/seed0"), entry("b/seed0")], "run") == {"gridworld": ["a/seed0", "b/seed0"]}
         assert labels([entry("a/seed0")], "run") == {"gridworld": ["seed0"]}
@@ -72,7 +72,7 @@ class TestGroups:
             ({"_target_": "my_package.make_better"}, "better"),
         ],
     )
-    def test_folders_that_do_not_know_their_choices_are_named_after_their_builder(self, settings, name):
+    def test_runs_without_recorded_choices_are_named_after_their_builder(self, settings, name):
         assert value_of(entry(algo=settings), "algo") == name
 
     def test_environment_and_network_are_named_alike(self):
@@ -103,7 +103,7 @@ class TestTasks:
         }
 
     @pytest.mark.parametrize("key", ["num_envs", "seed", "device"])
-    def test_what_does_not_change_the_task_does_not_split_it(self, key):
+    def test_settings_that_do_not_change_the_task_do_not_split_it(self, key):
         assert task_key(entry(env={key: 1})) == task_key(entry(env={key: 2}))
         assert len(rows_of([entry(env={key: 1}), entry(env={key: 2})], [])) == 1
 
@@ -125,7 +125,7 @@ class TestTasks:
         assert (row.title, row.groups) == ("gridworld", {"v2": entries})
 
 
-def test_differences_are_settings_beside_task_and_seed():
+def test_differences_are_settings_besides_task_and_seed():
     first = entry(env={"view": 3, "num_envs": 8}, seed=0, device="cpu", total_frames=10, algo={"sub": {"tau": 0.1}})
     second = entry(env={"view": 5, "num_envs": 9}, seed=1, device="auto", total_frames=20, algo={"sub": {"tau": 0.2}})
     assert differences([first, second]) == ["total_frames", "env.num_envs", "algo.sub.tau"]

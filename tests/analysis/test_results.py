@@ -33,7 +33,7 @@ def write(folder, text, **files):
 
 
 class TestReading:
-    def test_columns_and_nan_for_empty_cells(self, tmp_path):
+    def test_metrics_are_read_as_columns_with_nan_for_empty_cells(self, tmp_path):
         (tmp_path / "metrics.csv").write_text("frames,loss\n0,\n10,0.5\n")
         metrics = read_metrics(tmp_path / "metrics.csv")
         assert metrics["frames"] == [0.0, 10.0]
@@ -49,7 +49,7 @@ class TestReading:
         [("", {}), ("frames,lo", {}), ("frames,loss\n", {"frames": [], "loss": []})],
         ids=["empty", "half a header", "header only"],
     )
-    def test_a_file_without_rows(self, tmp_path, text, columns):
+    def test_a_metrics_file_without_rows_is_empty(self, tmp_path, text, columns):
         (tmp_path / "metrics.csv").write_text(text)
         assert read_metrics(tmp_path / "metrics.csv") == columns
 
@@ -81,7 +81,7 @@ class TestReading:
         assert (done.summary, done.failed) == ({"return_mean": 1.5, "frames": 10}, False)
         assert (failed.summary, failed.failed) == ({}, True)
 
-    def test_the_summary_of_a_run_that_went_on_since_does_not_count(self, tmp_path):
+    def test_the_summary_of_a_run_that_was_resumed_since_is_ignored(self, tmp_path):
         run = read_run(write(tmp_path / "run", "frames\n10\n20\n", summary_json='{"return_mean": 1, "frames": 10}'))
         assert run.summary == {}
 
@@ -95,7 +95,7 @@ class TestReading:
             ("frames\n1\n", "[1]", "summary.json must hold"),
         ],
     )
-    def test_a_run_that_cannot_be_read_says_why(self, tmp_path, text, summary, reason):
+    def test_a_run_that_can_not_be_read_is_reported_with_the_reason(self, tmp_path, text, summary, reason):
         files = {} if summary is None else {"summary_json": summary}
         with pytest.raises(ValueError, match=reason):
             read_run(write(tmp_path / "run", text, **files))
@@ -129,12 +129,12 @@ class TestFindRuns:
     def test_folders_with_metrics_at_or_below_a_pattern(self, outputs, patterns, found):
         assert find_runs(patterns) == [Path("outputs") / name for name in found]
 
-    def test_absolute_patterns(self, outputs):
+    def test_runs_are_found_by_absolute_patterns(self, outputs):
         assert find_runs([f"{outputs}/sweep/**"]) == [outputs / "sweep/0-v1", outputs / "sweep/1-v2"]
 
 
 class TestCurve:
-    def test_gaps_are_left_out(self):
+    def test_gaps_are_left_out_of_a_curve(self):
         run = run_of(frames=[0, 10, 20], greedy__return=[0.5, NAN, 1])
         assert [part.tolist() for part in curve(run, "greedy/return")] == [[0, 20], [0.5, 1]]
 
@@ -165,7 +165,7 @@ class TestCurve:
             (99, [1.5, 3, 11 / 3, 4.5]),
         ],
     )
-    def test_smoothing_is_a_centred_average_of_what_there_is(self, window, expected):
+    def test_smoothing_is_a_centred_average_of_the_available_points(self, window, expected):
         assert smoothed(np.array([1.0, 2.0, 6.0, 3.0]), window) == pytest.approx(expected)
 
     def test_smoothing_keeps_short_curves_as_they_are(self):
@@ -183,10 +183,10 @@ class TestFinalValue:
             ("frames until nothing>=1", None),
         ],
     )
-    def test_how_long_it_took(self, asked, expected):
+    def test_a_final_value_can_be_the_time_to_reach_a_level(self, asked, expected):
         run = run_of(frames=[0, 10, 20, 30], wall_seconds=[0, 3, 6, 9], behaviour__return=[NAN, 0.5, 1, 1.5])
         assert final_value(run, asked) == pytest.approx(NAN if expected is None else expected, nan_ok=True)
 
-    def test_the_source_of_a_column(self):
+    def test_a_time_to_a_level_has_the_source_of_its_column(self):
         assert source_of("frames until behaviour/return>=1") == "behaviour/return"
         assert source_of("greedy/return") == "greedy/return"

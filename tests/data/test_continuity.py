@@ -23,12 +23,12 @@ def many_batches(name="v2", num_envs=4, steps=3, batches=16):
 
 class TestOneCollector:
     @pytest.mark.parametrize("steps", [1, 2, 7, 20])
-    def test_its_batches_go_on(self, steps):
+    def test_batches_of_one_collector_are_accepted(self, steps):
         continuity = Continuity()
         for batch in many_batches(steps=steps)[1]:
             continuity.check(batch)
 
-    def test_a_collector_that_begins_anew_is_one_that_goes_on(self):
+    def test_batches_of_a_collector_that_starts_again_are_accepted(self):
         continuity, (algorithm, batches) = Continuity(), many_batches()
         collector = make_collector(algorithm, small_env(4), 5)
         for batch, _ in zip(collector, range(3), strict=False):
@@ -37,7 +37,7 @@ class TestOneCollector:
         for batch in batches:
             continuity.check(batch)
 
-    def test_a_learner_that_was_loaded_takes_any_batch_first(self):
+    def test_a_loaded_learner_accepts_any_first_batch(self):
         algorithm, batches = many_batches("drqn")
         learner = algorithm.learners["flat"]
         for batch in batches[:4]:
@@ -49,7 +49,7 @@ class TestOneCollector:
 
 class TestSeveralCollectors:
     @pytest.mark.parametrize("name", EVERY)
-    def test_batches_of_two_by_turns_are_refused_by_every_learner(self, name):
+    def test_alternating_batches_of_two_collectors_are_refused_by_every_learner(self, name):
         algorithm, first = many_batches(name)
         second = many_batches(name)[1]
         for batch in second:
@@ -59,7 +59,7 @@ class TestSeveralCollectors:
                 for batch in pair:
                     algorithm.observe(batch)
 
-    def test_rows_of_two_in_one_batch_are_refused(self):
+    def test_rows_of_two_collectors_in_one_batch_are_refused(self):
         first, second = (many_batches(num_envs=2)[1][-1] for _ in range(2))
         second["collector", "traj_ids"] += 1000
         Continuity().check(torch.cat([first, second], 0))  # side by side they are worlds like others
@@ -67,7 +67,7 @@ class TestSeveralCollectors:
         with pytest.raises(ValueError, match=r"got the middle of episode 10\d\d after .* \(environment 0, step 3\)"):
             Continuity().check(torch.cat([first, second], 1))
 
-    def test_a_missing_batch_is_found_if_an_episode_ended_in_it(self):
+    def test_a_missing_batch_is_noticed_if_an_episode_ended_in_it(self):
         batches = many_batches(steps=5)[1]
         continuity = Continuity()
         with pytest.raises(ValueError, match="batch must go on where the last one ended"):
@@ -87,7 +87,7 @@ class TestSeveralCollectors:
             ("v3", "compact_obs", "batch must hold all that environment and policy wrote, .* without compact_obs"),
         ],
     )
-    def test_options_of_the_collector_that_change_what_happened_are_refused(self, name, option, message):
+    def test_collector_options_that_alter_the_episodes_are_refused(self, name, option, message):
         env = Corridor(4, length=7)
         algorithm = build(name, env)
         collector = make_collector_of(algorithm.transform(env), algorithm, **{option: True})
@@ -124,7 +124,7 @@ class TestSeveralCollectors:
 
     @pytest.mark.slow
     @pytest.mark.parametrize("kind", [MultiSyncCollector, MultiAsyncCollector])
-    def test_torchrl_s_collectors_of_several_processes_are_refused_in_words(self, kind):
+    def test_collectors_of_several_processes_are_refused_with_a_message(self, kind):
         algorithm = build("v1", small_env(2))
         make = partial(seen_by, algorithm.make_transforms)
         collector = kind(
@@ -141,7 +141,7 @@ class TestTimeLimits:
 
     @pytest.mark.parametrize("name", HIERARCHICAL)
     @pytest.mark.parametrize("where", ["collector", "behind the agent's transforms"])
-    def test_one_behind_the_option_book_is_refused(self, name, where):
+    def test_a_time_limit_behind_the_option_book_is_refused(self, name, where):
         env = Corridor(4, length=None)
         algorithm = build(name, env)
         seen, limit = algorithm.transform(env), {}
@@ -155,7 +155,7 @@ class TestTimeLimits:
                 algorithm.observe(batch)
 
     @pytest.mark.parametrize("name", EVERY)
-    def test_one_before_it_is_right(self, name):
+    def test_a_time_limit_before_the_option_book_is_accepted(self, name):
         env = TransformedEnv(Corridor(4, length=None), StepCounter(max_steps=5))
         algorithm = build(name, env)
         assert algorithm.task.max_steps == 5
@@ -168,7 +168,7 @@ class TestTimeLimits:
             assert torch.isfinite(learner.learn()["loss"])
 
     @pytest.mark.parametrize("name", ["dqn", "drqn"])
-    def test_flat_agents_take_one_anywhere(self, name):
+    def test_flat_agents_accept_a_time_limit_anywhere(self, name):
         env = Corridor(4, length=None)
         algorithm = build(name, env)
         collector = make_collector_of(algorithm.transform(env), algorithm, max_frames_per_traj=5)

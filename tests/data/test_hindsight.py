@@ -1,4 +1,4 @@
-"""Hindsight at both levels, against transitions written down by hand, plain loops, and play told to do so."""
+"""Hindsight at both levels, against hand-written transitions, plain loops, and play for the other subgoals."""
 
 from functools import partial
 from itertools import pairwise
@@ -127,7 +127,7 @@ class TestRelabelSubgoals:
             ),
         ],
     )  # fmt: skip
-    def test_told_for_the_other_subgoal(self, played, told):
+    def test_a_sequence_is_relabelled_for_the_other_subgoal(self, played, told):
         sample = sequence(**played)
         before = sample.clone()
         found = relabel_subgoals(sample, 2, rewards=IntrinsicReward(wrong_subgoal=-0.5))
@@ -138,7 +138,7 @@ class TestRelabelSubgoals:
         assert (found["extra"] == sample["extra"]).all()
         assert (sample == before).all() and "eligible" not in sample
 
-    def test_a_truncated_episode_is_an_end_for_all(self):
+    def test_a_truncated_episode_ends_for_every_subgoal(self):
         sample = sequence(**BOTH_REACHED)
         sample["next", "terminated"].fill_(False)
         sample["next", "attained"][0, 4] = torch.tensor([True, False])  # goal 1 was pursued, goal 0 reached
@@ -147,14 +147,14 @@ class TestRelabelSubgoals:
             told = shown(relabel_subgoals(sample, 2)[1])
             assert (told["done"], told["terminated"]) == ("4" if done else "", "")
 
-    def test_episodes_one_after_the_other(self):
+    def test_a_sequence_of_several_episodes_is_relabelled_episode_by_episode(self):
         """As ``sampling="episode_starts"`` gives them: what was attained in the first can be in the second."""
         first, second = sequence(**ON_THE_WAY), sequence(**ON_THE_WAY)
         told = shown(relabel_subgoals(torch.cat([first, second], 1), 2)[1])
         assert (told["init"], told["done"], told["eligible"]) == ("0246", "1357", "0145")
 
-    def test_three_subgoals_and_two_sequences(self):
-        """Every sequence is told for each subgoal once, counted on from the one it began with."""
+    def test_three_subgoals_triple_the_sequences(self):
+        """Every sequence appears once for each subgoal, counted on from the one it began with."""
         played = {"mask": "111 111", "init": "0", "done": "", "reward": [0.0, 0.0]}
         first = sequence(pursued="11", attained="000 001", **played)
         second = sequence(pursued="20", attained="000 100", **(played | {"init": "01", "done": "0"}))
@@ -166,13 +166,13 @@ class TestRelabelSubgoals:
         assert [shown(row)["reward"][1] for row in found] == [0.0, 0.0, 2.0, 2.0, -0.25, -0.25]
         assert [shown(row)["terminated"] for row in found] == ["", "", "1", "1", "", ""]
 
-    def test_a_stored_state_is_that_of_the_subgoal_that_was_pursued(self):
+    def test_stored_states_are_kept_only_for_the_pursued_subgoal(self):
         sample = sequence(**ON_THE_WAY)
         sample["hidden"] = torch.rand(1, 4, 3)
         kept, told = relabel_subgoals(sample, 2, state_keys=["hidden"])["hidden"]
         assert torch.equal(kept, sample["hidden"][0]) and not told.any()
 
-    def test_one_subgoal_is_left_alone(self):
+    def test_a_single_subgoal_needs_no_relabelling(self):
         played = {"pursued": "00", "attained": "0 1", "mask": "1 1", "init": "0", "done": "1", "terminated": "1"}
         sample = sequence(**played, reward=[0.0, 1.0])
         found = relabel_subgoals(sample, 1)
@@ -210,7 +210,7 @@ def play(actions, proposals, **book):
 
 @pytest.mark.parametrize("book", [{}, {"repeatable": True, "wrong_subgoal_reward": -0.5}], ids=str)
 @pytest.mark.parametrize("goal", [0, 1])
-def test_what_is_told_for_a_subgoal_is_what_acting_for_it_would_have_recorded(goal, book):
+def test_relabelling_for_a_subgoal_gives_what_acting_for_it_would_have_recorded(goal, book):
     """The same worlds and the same actions, once as it came and once sent to ``goal`` at every choice."""
     torch.manual_seed(0)
     actions, proposals = torch.randint(4, (64, 30)), torch.randint(2, (64, 30))
@@ -222,7 +222,7 @@ def test_what_is_told_for_a_subgoal_is_what_acting_for_it_would_have_recorded(go
     acted = select(play(actions, torch.full_like(proposals, goal), **book))
     compared = told["eligible"].squeeze(-1)
     assert torch.equal(compared, acted["subgoal_mask"][..., goal]) and (told["subgoal"] == goal).all()
-    assert (played["option_init"] != told["option_init"])[compared].sum() > 40  # there was something to tell
+    assert (played["option_init"] != told["option_init"])[compared].sum() > 40  # relabelling changed something
     for key in ("subgoal", "option_init", *(("next", name) for name in SUB_NEXT)):
         assert torch.equal(told[key][compared], acted[key][compared]), key
 
@@ -250,8 +250,8 @@ class TestSubLearner:
         assert (sample["subgoal"][16:, 0] == 1 - sample["subgoal"][:16, 0]).all()
         assert learner.update(sample)["loss"] > 0
 
-    def test_what_could_not_be_chosen_teaches_nothing(self):
-        """Neither by itself nor through the state or the targets of other steps; here sequences span many episodes."""
+    def test_steps_whose_subgoal_could_not_be_chosen_do_not_affect_learning(self):
+        """Neither directly nor through the state or the targets of other steps; sequences span many episodes here."""
         torch.manual_seed(0)
         env = small_env(8)
         algorithm = build("v2", env, settings=tiny_settings(trace_decay=0.9), sub_hindsight=True)
@@ -268,7 +268,7 @@ class TestSubLearner:
         changed["eligible"].fill_(True)
         assert learner.loss(changed)["loss"] != before["loss"]
 
-    def test_the_sequences_as_they_were_teach_what_they_did_without_hindsight(self):
+    def test_the_original_sequences_have_the_same_loss_as_without_hindsight(self):
         learner = self.learner()
         sample = learner.sample()
         plain = build("v2", small_env(8), settings=tiny_settings()).learners["sub"]
@@ -276,7 +276,7 @@ class TestSubLearner:
         plain.loss.load_state_dict(learner.loss.state_dict())
         assert torch.equal(learner.loss(sample[:16])["loss"], plain.loss(sample[:16].exclude("eligible"))["loss"])
 
-    def test_only_with_hindsight_more_is_stored(self):
+    def test_more_entries_are_stored_only_with_hindsight(self):
         env = small_env(4)
         batch = collect(build("v2", env), env, 6)[0]
         keys = [
@@ -286,8 +286,8 @@ class TestSubLearner:
         assert keys[1] - keys[0] == {"subgoal_mask", ("next", "attained"), ("next", "hazard")}
 
     @pytest.mark.parametrize("rewards", [{}, {"wrong_subgoal_reward": -0.5, "hazard_reward": -0.25}], ids=str)
-    def test_rewards_reach_it(self, rewards):
-        """Told for the subgoal that was pursued, every reward is the one that was stored."""
+    def test_relabelling_uses_the_rewards_of_the_option_book(self, rewards):
+        """Relabelled for the subgoal that was pursued, every reward is the stored one."""
         torch.manual_seed(0)
         env = small_env(8)
         learner = build("v2", env, sub_hindsight=True, **rewards).learners["sub"]
@@ -379,7 +379,7 @@ def stored(options):
     return [(*o[:3], None, *o[4:7], None, o[8]) if o[8] == "terminated" else o for o in options]
 
 
-# (played, the options as they were, as they are told)
+# (played, the options as they were, as they are relabelled)
 EPISODES = {
     "another on the way": (
         {"pursued": "111", "attained": "00 10 01", "reward": [0.0, 1.0, 1.0]},
@@ -445,8 +445,8 @@ EPISODES = {
 class TestHindsightOptions:
     @pytest.mark.parametrize("length", [1, 2, 3, 6])
     @pytest.mark.parametrize(("played", "as_they_were", "told"), EPISODES.values(), ids=EPISODES)
-    def test_an_episode(self, played, as_they_were, told, length):
-        """Whatever batches it comes in."""
+    def test_an_episode_gives_its_options_and_those_in_hindsight(self, played, as_they_were, told, length):
+        """However it is cut into batches."""
         steps = episode(**played)
         batches = steps.split(length, 1)
         extractor, taken = make_extractor(), []
@@ -457,8 +457,8 @@ class TestHindsightOptions:
         assert all(options is None for options in taken[:-1])
         assert listed(taken[-1]) == stored(as_they_were + told)
 
-    def test_many_environments_and_episodes(self):
-        """Each tells its own, whichever ends when; and a state carries all that is in progress."""
+    def test_episodes_of_many_environments_are_relabelled_separately(self):
+        """Whichever ends first; and a state carries all that is in progress."""
         names = [name for name, (played, _, _) in EPISODES.items() if len(played["attained"].split()[0]) == 2]
         rows, wanted = [], []
         for shift in range(3):
@@ -481,15 +481,15 @@ class TestHindsightOptions:
         assert sum(a != b for a, b in pairwise(episodes)) == len(set(episodes)) - 1  # each comes in one piece
         assert extractor.state_dict()["hindsight"]["changed"].numel() <= 3  # finished episodes are forgotten
 
-    def test_after_a_reset_nothing_is_left_of_before(self):
+    def test_a_reset_forgets_episodes_in_progress(self):
         played, real, told = EPISODES["another on the way"]
         extractor = make_extractor()
         extractor(episode(**EPISODES["two others on the way"][0])[:, :3])
         extractor.reset()
         assert listed(extractor(episode(**played))) == stored(real + told)
 
-    def test_an_episode_whose_beginning_is_unknown(self):
-        """What is left from the first attainment on is known; where options began before it is not."""
+    def test_an_episode_whose_beginning_is_unknown_is_relabelled_from_the_first_attainment(self):
+        """Options from the first attainment on are known; earlier ones are not."""
         played, _, told = EPISODES["two others on the way"]
         options = make_extractor()(episode(**played)[:, 1:])
         assert [row[1:] for row in listed(options)] == [row[1:] for row in stored(told[1:])]
@@ -520,7 +520,7 @@ class TestHindsightOptions:
         assert torch.equal(found["observation"], expected["observation"])
         assert torch.equal(found["episode"], expected["collector", "traj_ids"])
 
-    def test_both_extractors_under_one_key(self):
+    def test_two_extractors_with_the_same_subgoal_key_are_refused(self):
         with pytest.raises(
             ValueError, match=r"active_subgoal_key of retold must differ from .*, got 'active_subgoal' "
         ):
@@ -528,7 +528,7 @@ class TestHindsightOptions:
 
 
 class PlainHindsight:
-    """Told options by a loop over environments and steps."""
+    """Relabelled options by a loop over environments and steps."""
 
     def __init__(self, gamma):
         self.gamma, self.open, self.held, self.restarts = gamma, {}, {}, set()
@@ -556,7 +556,7 @@ class PlainHindsight:
 
 
 @pytest.mark.parametrize(("num_envs", "length"), [(1, 2), (4, 17), (3, 1)])
-def test_random_play_against_plain_loops(num_envs, length):
+def test_relabelled_options_of_random_play_agree_with_plain_loops(num_envs, length):
     steps, total = random_play(num_envs, 51), 0
     pursued, retold = OptionExtractor(), OptionExtractor(active_subgoal_key="hindsight_subgoal")
     extractor, as_they_were = HindsightOptions(pursued, retold, gamma=0.99), OptionExtractor()
@@ -585,7 +585,7 @@ def test_random_play_against_plain_loops(num_envs, length):
 
 
 def told_options(name="v2", **options):
-    """An algorithm with hindsight at the meta level, the steps that it collected, and what it tells of them."""
+    """An algorithm with hindsight at the meta level, the steps that it collected, and their options in hindsight."""
     torch.manual_seed(0)
     env = small_env(8)
     algorithm = build(name, env, meta_hindsight=True, gamma=0.5, **options)
@@ -597,7 +597,7 @@ def told_options(name="v2", **options):
 
 
 def places(steps, told):
-    """Environment, first and last step of each told option; they come in order, without gaps."""
+    """Environment, first and last step of each relabelled option; they come in order, without gaps."""
     number, found = None, []
     for row in told:
         if row["collector", "traj_ids"] != number:
@@ -638,7 +638,7 @@ class TestMetaInputs:
                     torch.testing.assert_close(row[key], start)
 
     @pytest.mark.parametrize("time", TIMES)
-    def test_refreshed_states_are_those_of_a_sub_controller_that_had_been_told_so(self, time):
+    def test_refreshed_states_are_those_of_a_sub_controller_with_the_relabelled_subgoal(self, time):
         algorithm, steps, told = told_options(meta_input_time=time, refresh_hidden_steps=7)
         network, state, changed = algorithm.policy.sub_controller.network, None, 0
         refreshed = algorithm.learners["meta"].refresh(told.clone().unsqueeze(0)).squeeze(0)
@@ -657,7 +657,7 @@ class TestMetaInputs:
 
 class TestMetaLearner:
     @pytest.mark.parametrize("name", ["hdqn", "v1", "v2"])
-    def test_a_sequence_tells_one_story(self, name):
+    def test_a_sequence_is_either_real_or_in_hindsight(self, name):
         """Real or in hindsight, and of one episode."""
         torch.manual_seed(0)
         env = small_env(8)
@@ -672,14 +672,14 @@ class TestMetaLearner:
         assert 0.1 < (number < 0).float().mean() < 0.9 and (valid.sum(-1) > 1).any() and len(learner.buffer) == 100
         assert learner.update(sample)["loss"] > 0
 
-    def test_without_hindsight_only_what_was_pursued_is_stored(self):
+    def test_without_hindsight_only_real_options_are_stored(self):
         env = small_env(8)
         algorithm = build("v2", env)
         options = algorithm.learners["meta"].extract(collect(algorithm, env, 20)[0])
         assert (options["collector", "traj_ids"] >= 0).all()
 
     @pytest.mark.parametrize("smdp_discount", [True, False])
-    def test_returns_are_discounted_as_the_option_book_does_it(self, smdp_discount):
+    def test_returns_are_discounted_as_in_the_option_book(self, smdp_discount):
         """A goal that an option attains in its second step pays 1 or 0.01."""
         _, _, told = told_options(smdp_discount=smdp_discount)
         second = told["next", "option_steps"] == 2
@@ -688,7 +688,7 @@ class TestMetaLearner:
 
 
 @pytest.mark.parametrize(("num_envs", "length"), [(3, 4), (5, 17)])
-def test_an_episode_that_comes_out_in_pieces_is_told_alike(num_envs, length):
+def test_an_episode_that_comes_out_in_pieces_is_relabelled_in_the_same_way(num_envs, length):
     """Each option on its own, as an episode without end is stored while it goes on."""
 
     def rows(options):

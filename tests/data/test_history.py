@@ -74,12 +74,12 @@ def test_states_after_longer_options_stay_as_stored():
     assert torch.equal(changed, (steps > 0) & (steps <= 3)) and (steps > 3).any()
 
 
-def test_a_refreshed_sample_is_learned_from():
+def test_a_refreshed_sample_can_be_learned_from():
     _, meta = filled_meta_learner(meta_input="hidden")
     assert meta.update(meta.sample())["loss"] > 0
 
 
-def test_max_steps_must_be_positive():
+def test_a_history_needs_a_positive_max_steps():
     with pytest.raises(ValueError, match="max_steps must be >= 1, got 0"):
         OptionHistory(0)
 
@@ -114,7 +114,7 @@ def test_a_history_is_that_of_the_option_before_in_the_same_episode():
 
 @pytest.mark.parametrize("num_envs", [1, 6])
 def test_an_option_whose_predecessor_is_unknown_has_no_history(num_envs):
-    """The first batch begins in mid-episode: what was observed before it belongs to nobody."""
+    """The first batch begins in mid-episode: what was observed before it is unknown."""
     steps = random_play(num_envs, 62)[:, 2:]
     options = extract(steps)
     traj = options["collector", "traj_ids"]

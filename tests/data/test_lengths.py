@@ -8,7 +8,7 @@ from hdrqn_torchrl.data import LongerEpisodes
 
 @pytest.mark.parametrize("length", [1, 3, 8, 9])
 @pytest.mark.parametrize("batch_len", [1, 4, 30])
-def test_over_many_batches_against_a_plain_loop(length, batch_len):
+def test_longer_episodes_are_found_over_many_batches_as_by_a_plain_loop(length, batch_len):
     """Episodes of the stream last up to nine steps; its steps are numbered."""
     stream, longer = Stream(3), LongerEpisodes(length)
     for _ in range(60 // batch_len):
@@ -16,7 +16,7 @@ def test_over_many_batches_against_a_plain_loop(length, batch_len):
         assert longer.seen(batch) == (batch["step"] >= length).any().item()
 
 
-def test_in_rows_each_piece_is_looked_at_for_itself():
+def test_each_piece_of_rows_is_measured_separately():
     longer = LongerEpisodes(4)
     assert not longer.seen(torch.cat([one_episode(0, 4), one_episode(1, 2)]))
     assert not longer.seen(one_episode(2, 3)) and longer.seen(one_episode(3, 5))

@@ -1,4 +1,4 @@
-"""How much room a stored step and a stored option take: each observation is there once."""
+"""The size of a stored step and of a stored option: each observation is there once."""
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ def bytes_of(rows):
 
 
 @pytest.mark.parametrize("name", ["dqn", "drqn", "hdqn", "v1", "v2", "v3"])
-def test_nothing_that_a_network_reads_is_stored_under_next(name):
+def test_no_network_input_is_stored_under_next(name):
     algorithm = build(name, small_env(8))
     (batch,) = collect(algorithm, small_env(8), 20)
     for level, learner in algorithm.learners.items():
@@ -33,7 +33,7 @@ def test_nothing_that_a_network_reads_is_stored_under_next(name):
         ("v2", "meta", {"sub_hidden": 4 * STATE, "subgoal_mask": 2}),
     ],
 )
-def test_a_row_holds_its_inputs_and_some_numbers(name, level, expected):
+def test_a_row_has_the_size_of_its_inputs_and_a_few_numbers(name, level, expected):
     algorithm = build(name, small_env(8))
     (batch,) = collect(algorithm, small_env(8), 20)
     stored = algorithm.learners[level].extract(batch)
@@ -43,7 +43,7 @@ def test_a_row_holds_its_inputs_and_some_numbers(name, level, expected):
 
 
 @pytest.mark.parametrize(("shape", "most"), [((3, 3), 60), ((3, 44, 44), 3 * 44 * 44 + 50)])
-def test_of_a_screen_as_well(shape, most):
+def test_a_row_of_a_screen_has_the_size_of_its_inputs_and_a_few_numbers(shape, most):
     """Montezuma's Revenge has 5,808 bytes an observation."""
     batch = TensorDict(observation=torch.zeros(2, 5, *shape, dtype=torch.uint8), batch_size=[2, 5])
     flag = torch.zeros(2, 5, 1, dtype=torch.bool)

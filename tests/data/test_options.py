@@ -51,7 +51,7 @@ def assert_same(options, expected):
 
 @pytest.mark.parametrize(("num_envs", "length"), SHAPES)
 class TestAgainstPlainLoops:
-    def test_over_many_batches(self, num_envs, length):
+    def test_options_over_many_batches_agree_with_plain_loops(self, num_envs, length):
         extractor, plain, options = OptionExtractor(), PlainExtractor(), 0
         for batch in batches_of(random_play(num_envs, 102), length):
             expected = plain(batch)
@@ -59,7 +59,7 @@ class TestAgainstPlainLoops:
             options += len(expected)
         assert options >= 20 * num_envs
 
-    def test_when_the_first_batch_begins_in_mid_episode(self, num_envs, length):
+    def test_a_first_batch_in_mid_episode_agrees_with_plain_loops(self, num_envs, length):
         steps = random_play(num_envs, 54)
         steps = steps[:, 2:] if num_envs > 1 else steps[:, 1:]
         assert not steps["option_init"][:, 0].all()
@@ -67,7 +67,7 @@ class TestAgainstPlainLoops:
         for batch in batches_of(steps, length):
             assert_same(extractor(batch), plain(batch))
 
-    def test_when_all_environments_are_reset_between_two_batches(self, num_envs, length):
+    def test_a_reset_between_two_batches_agrees_with_plain_loops(self, num_envs, length):
         extractor, plain = OptionExtractor(), PlainExtractor()
         whole = 4 * length if length > 5 else 6 * length + (0 if length > 1 else 2)
         for part in range(3):
@@ -75,7 +75,7 @@ class TestAgainstPlainLoops:
             for batch in batches_of(steps, length):
                 assert_same(extractor(batch), plain(batch))
 
-    def test_a_state_dict_carries_it_over(self, num_envs, length):
+    def test_a_state_dict_carries_options_in_progress_over(self, num_envs, length):
         extractor, plain = OptionExtractor(), PlainExtractor()
         for batch in batches_of(random_play(num_envs, 51), length):
             successor = OptionExtractor()
@@ -117,7 +117,7 @@ def endless(num_envs, length, *, mean_episode=None, seed=0):
 class TestEpisodesWithoutEnd:
     @pytest.mark.parametrize("mean_episode", [None, 40, 6])
     @pytest.mark.parametrize(("num_envs", "length", "max_held"), [(1, 3, 1), (3, 7, 4), (4, 50, 3), (2, 1, 9)])
-    def test_their_options_come_out_in_pieces_each_once_in_order(self, num_envs, length, max_held, mean_episode):
+    def test_options_of_an_endless_episode_come_out_once_in_order(self, num_envs, length, max_held, mean_episode):
         steps = endless(num_envs, 200, mean_episode=mean_episode)
         settings = {"input_keys": ["observation"], "mask_key": None}
         pieces, whole = OptionExtractor(max_held=max_held, **settings), OptionExtractor(max_held=10_000, **settings)
@@ -177,13 +177,13 @@ class TestEpisodesWithoutEnd:
         seen = torch.arange(6) <= length
         assert (pieces["history"] == whole["history"])[seen & (length > 0)].all()
 
-    def test_other_environments_than_before_are_refused(self):
+    def test_another_number_of_environments_than_before_is_refused(self):
         extractor = OptionExtractor(input_keys=["observation"], mask_key=None)
         extractor(endless(3, 5))
         with pytest.raises(ValueError, match="batch must hold the same 3 environments as those before, got 2; give"):
             extractor(endless(2, 5))
 
-    def test_the_limit_must_be_positive(self):
+    def test_max_held_must_be_positive(self):
         with pytest.raises(ValueError, match="max_held must be >= 1 option, got 0; "):
             OptionExtractor(max_held=0)
 
@@ -194,7 +194,7 @@ class TestOptions:
         taken = [extractor(batch) for batch in batches_of(random_play(6, 102), 6)]
         return torch.cat([options for options in taken if options is not None], 0)
 
-    def test_what_an_option_led_to_differs_from_its_start(self):
+    def test_the_outcome_of_an_option_differs_from_its_start(self):
         options, known = options_of(self.extract(), "observation")
         moved = (options["observation"] != options["next", "observation"]).flatten(1).any(-1)[known]
         assert known.any() and moved.float().mean() > 0.7  # an overwritten start would make it 0
@@ -228,20 +228,20 @@ class TestOptions:
         )  # steps up to the last end of an episode
         assert options["next", "option_steps"].sum() == finished
 
-    def test_only_what_is_asked_for_is_kept(self):
+    def test_an_option_keeps_only_the_requested_entries(self):
         options = self.extract(input_keys=["extra"], mask_key=None)
         assert set(options.keys(True, True)) == {
             "extra", "is_init", "subgoal", ("collector", "traj_ids"), ("next", "option_steps"),
             ("next", "option_return"), ("next", "done"), ("next", "terminated"),
         }  # fmt: skip
 
-    def test_states_are_kept_from_the_start_only(self):
+    def test_recurrent_states_are_kept_only_from_the_start_of_an_option(self):
         extractor, batch = OptionExtractor(input_keys=["observation"], state_keys=["extra"]), random_play(3, 60)
         options, expected = options_of(extractor(batch))[0], PlainExtractor()(batch)
         assert options["extra"].tolist() == [start["extra"].item() for start, _ in expected]
         assert "extra" not in options["next"]
 
-    def test_at_end_changes_what_truncated_episodes_ended_with_and_nothing_else(self):
+    def test_at_end_changes_only_the_final_rows_of_truncated_episodes(self):
         plain = self.extract(input_keys=["observation"])
         changed = self.extract(at_end=lambda after: after.set("observation", after["observation"] + 1))
         final = (plain["next", "done"] & ~plain["next", "terminated"]).squeeze(-1)
@@ -275,7 +275,7 @@ class TestOptions:
 
 
 class TestStepSelector:
-    def test_it_keeps_what_is_asked_for_and_the_ends_of_the_episode(self):
+    def test_a_step_keeps_the_requested_entries_and_the_ends_of_the_episode(self):
         select = StepSelector(root_keys=["observation"], next_keys=["extra"])
         steps = random_play(2, 6)
         kept = select(steps)

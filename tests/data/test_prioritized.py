@@ -95,7 +95,7 @@ def starts_of(sample):
 class TestSlices:
     @pytest.mark.parametrize(("num_envs", "length"), [(1, 7), (3, 4), (2, 13)])
     @pytest.mark.parametrize("slice_len", [1, 4, 11])
-    def test_each_is_complete_and_never_goes_over_an_end_or_the_rings_seam(self, sampling, num_envs, length, slice_len):
+    def test_each_slice_is_complete_and_crosses_no_end_and_no_seam(self, sampling, num_envs, length, slice_len):
         torch.manual_seed(0)
         world, wrapped, short = World(sampling, num_envs=num_envs, slice_len=slice_len), 0, 0
         for _ in range(100 // length):
@@ -133,7 +133,7 @@ class TestSlices:
         distance = ((counts - expected) ** 2 / expected).sum().item()  # chi square with n - 1 degrees of freedom
         assert distance < len(scaled) + 5 * (2 * len(scaled)) ** 0.5
 
-    def test_weights_make_up_for_the_priorities(self, sampling):
+    def test_weights_correct_for_the_priorities(self, sampling):
         torch.manual_seed(0)
         world = World(sampling)
         world.extend(25)
@@ -144,7 +144,7 @@ class TestSlices:
         torch.testing.assert_close(sample["priority_weight"], wanted.unsqueeze(-1).expand(64, 4))
 
 
-def test_a_capacity_that_is_no_multiple_of_the_environments():
+def test_a_capacity_that_is_not_a_multiple_of_num_envs_is_rounded_up():
     """The storage rounds it up."""
     buffer, world = None, World("steps", longest=1)
     buffer = make_sequence_buffer(64, slice_len=2, batch_size=512, num_envs=3, sampling="steps", priority_exponent=1.0)
@@ -156,7 +156,7 @@ def test_a_capacity_that_is_no_multiple_of_the_environments():
 
 
 class TestNewSteps:
-    def test_they_have_the_largest_priority_there_ever_was(self):
+    def test_new_steps_have_the_largest_priority_so_far(self):
         torch.manual_seed(0)
         world = World("steps", batch_size=4_000, rows=60)
         world.extend(20)
@@ -170,7 +170,7 @@ class TestNewSteps:
         mass = len(new) * (8 + FLOOR) ** ALPHA, len(old) * (0.5 + FLOOR) ** ALPHA
         assert share == pytest.approx(mass[0] / sum(mass), abs=0.03)
 
-    def test_starts_whose_slice_grew_complete_are_new(self):
+    def test_starts_whose_slice_became_complete_are_new(self):
         """They were stored before, when their episode had too few steps."""
         torch.manual_seed(0)
         world = World("whole_episodes", num_envs=1, slice_len=20, rows=60, longest=30)
@@ -186,7 +186,7 @@ class TestNewSteps:
         world.extend(2)
         assert set(starts_of(world.sample())) >= {(0, 2), (0, 3)}
 
-    def test_steps_that_were_written_over_leave_nothing(self):
+    def test_overwritten_steps_leave_no_priority(self):
         torch.manual_seed(0)
         world = World("steps", num_envs=2, rows=12, longest=1)
         world.extend(12)
@@ -211,7 +211,7 @@ class TestRows:
         return td
 
     @pytest.mark.parametrize("sampling", ["steps", "whole_episodes"])
-    def test_slices_and_priorities(self, sampling):
+    def test_slices_of_rows_are_drawn_by_priority(self, sampling):
         torch.manual_seed(0)
         settings = {"slice_len": 3, "batch_size": 256, "sampling": sampling, "priority_exponent": 1.0}
         buffer = make_sequence_buffer(20, **settings)
@@ -231,7 +231,7 @@ class TestRows:
 class TestState:
     @pytest.mark.parametrize("sampling", SAMPLINGS)
     @pytest.mark.parametrize("batches", [3, 11], ids=["before", "after"])
-    def test_a_copy_draws_and_learns_alike(self, sampling, batches, tmp_path):
+    def test_a_copy_draws_and_updates_priorities_alike(self, sampling, batches, tmp_path):
         """Through a file, into a memory with another past; then many draws, writes and new priorities."""
         torch.manual_seed(0)
         first, second = World(sampling), World(sampling, seed=1)
@@ -257,7 +257,7 @@ class TestState:
         first, second = (torch.stack(samples) for samples in drawn)
         assert len(first) == 48 and (first == second).all()
 
-    def test_an_empty_one(self):
+    def test_the_state_of_an_empty_sampler_is_restored(self):
         first, second = World("steps"), World("steps")
         second.extend(9)
         second.sample()
@@ -267,7 +267,7 @@ class TestState:
         second.extend(9)
         assert (second.sample()["priority_weight"] == (1 + FLOOR) ** (-ALPHA * 0.6)).all()
 
-    def test_torch_alone_decides_what_is_drawn(self):
+    def test_only_torchs_random_numbers_decide_what_is_drawn(self):
         world, drawn = World("steps"), []
         world.extend(20)
         for seed in (0, 0, 1):
@@ -277,7 +277,7 @@ class TestState:
         assert drawn[0] == drawn[1] != drawn[2]
 
 
-def test_steps_left_against_a_plain_loop():
+def test_steps_left_agrees_with_a_plain_loop():
     generator = torch.Generator().manual_seed(0)
     for newest in range(7):
         episode = torch.randint(3, (7, 4), generator=generator).cumsum(0)
@@ -291,6 +291,6 @@ def test_steps_left_against_a_plain_loop():
                 assert left[row, env] == (last - row) % 7 + 1 and ended[row, env] == done[last, env]
 
 
-def test_episodes_can_not_be_drawn_first():
+def test_sampling_episodes_by_priority_is_refused():
     with pytest.raises(ValueError, match=r"sampling must be 'steps', .* with priority_exponent, got 'episodes'"):
         make_sequence_buffer(100, slice_len=4, batch_size=2, sampling="episodes", priority_exponent=0.5)

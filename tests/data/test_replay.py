@@ -15,7 +15,7 @@ class TestSequencesOfSteps:
     @pytest.mark.parametrize("sampling", PADDED)
     @pytest.mark.parametrize("num_envs", [1, 3])
     @pytest.mark.parametrize(("length", "slice_len"), [(2, 4), (3, 4), (8, 4), (2, 1)])
-    def test_each_is_one_trajectory_before_and_after_the_ring_is_full(self, num_envs, length, slice_len, sampling):
+    def test_each_sequence_is_one_trajectory_in_a_partial_or_full_ring(self, num_envs, length, slice_len, sampling):
         torch.manual_seed(0)
         capacity = 60 * num_envs
         buffer = make_sequence_buffer(
@@ -31,7 +31,7 @@ class TestSequencesOfSteps:
         assert full > 5
 
     @pytest.mark.parametrize("sampling", ["steps", "episodes"])
-    def test_every_stored_step_is_shown(self, sampling):
+    def test_every_stored_step_is_drawn(self, sampling):
         torch.manual_seed(0)
         buffer = make_sequence_buffer(90, slice_len=4, batch_size=64, num_envs=3, sampling=sampling)
         stored = Stream(3).take(30)
@@ -54,7 +54,7 @@ class TestSequencesOfSteps:
 
 
 @pytest.mark.parametrize("sampling", PADDED)
-def test_sequences_of_options_from_rows_of_whole_episodes(sampling):
+def test_sequences_of_options_are_drawn_from_rows_of_whole_episodes(sampling):
     torch.manual_seed(0)
     buffer = make_sequence_buffer(40, slice_len=8, batch_size=16, sampling=sampling)
     for episode in range(60):
@@ -75,7 +75,7 @@ def start_counts(sampling):
     return (starts["collector", "traj_ids"] * 2 + starts["step"]).bincount(minlength=10) / len(starts)
 
 
-def test_sampling_by_steps_starts_anywhere_alike():
+def test_sampling_by_steps_starts_anywhere_with_equal_probability():
     assert start_counts("steps").tolist() == pytest.approx([0.1] * 10, abs=0.03)
 
 
@@ -104,7 +104,7 @@ class TestRandomEpisodes:
             drawn.append(sample_sequences(buffer, 4).select("step", ("collector", "traj_ids"), ("collector", "mask")))
         assert (drawn[0] == drawn[1]).all()
 
-    def test_where_they_begin_does_not_depend_on_what_is_drawn_beyond(self):
+    def test_where_slices_begin_does_not_depend_on_the_lookahead(self):
         starts = []
         for lookahead in (0, 3):
             torch.manual_seed(0)
@@ -125,7 +125,7 @@ def last_steps(buffer):
 
 
 class TestWholeEpisodes:
-    def test_each_episode_is_as_likely_and_shown_from_its_start_to_its_end(self):
+    def test_episodes_are_equally_likely_and_shown_from_start_to_end(self):
         torch.manual_seed(0)
         buffer = make_sequence_buffer(10, slice_len=4, batch_size=3_000, sampling="whole_episodes")
         buffer.extend(torch.cat([one_episode(0, 2), one_episode(1, 7), one_episode(2, 1)]))
@@ -135,7 +135,7 @@ class TestWholeEpisodes:
         assert (real == torch.tensor([2, 4, 1])[episode]).all()
         assert (episode.bincount() / 3_000).tolist() == pytest.approx([1 / 3] * 3, abs=0.04)
 
-    def test_an_episode_whose_start_was_written_over_is_not_shown(self):
+    def test_an_episode_whose_start_was_overwritten_is_not_drawn(self):
         torch.manual_seed(0)
         buffer, stream = (
             make_sequence_buffer(24, slice_len=3, batch_size=64, num_envs=2, sampling="whole_episodes"),
@@ -150,14 +150,14 @@ class TestWholeEpisodes:
             assert (sample_sequences(buffer, 3)["step"][:, 0] == 0).all()
         assert beheaded > 10
 
-    def test_without_any_start_it_says_what_to_do(self):
+    def test_without_any_start_of_an_episode_an_error_says_what_to_do(self):
         buffer = make_sequence_buffer(4, slice_len=2, batch_size=2, sampling="whole_episodes")
         buffer.extend(one_episode(0, 6)[2:])
         with pytest.raises(RuntimeError, match="raise capacity above the length of an episode"):
             sample_sequences(buffer, 2)
 
 
-def test_the_device_is_that_of_the_storage():
+def test_sequences_are_on_the_device_of_the_storage():
     for device in ("cpu", "meta"):
         buffer = make_sequence_buffer(10, slice_len=2, batch_size=2, device=device)
         assert torch.device(buffer.storage.device).type == device
@@ -176,18 +176,18 @@ def test_the_device_is_that_of_the_storage():
         ({"sampling": "episode_starts"}, "sampling must be 'steps', .* for rows, got 'episode_starts'"),
     ],
 )
-def test_wrong_values(settings, message):
+def test_wrong_arguments_of_a_buffer_are_refused(settings, message):
     settings = {"capacity": 100, "slice_len": 4, "batch_size": 2} | settings
     with pytest.raises(ValueError, match=message):
         make_sequence_buffer(settings.pop("capacity"), **settings)
 
 
 class TestRoomForStarts:
-    """Whether the smallest capacity that is accepted always holds a sequence, and a smaller one may not."""
+    """The smallest capacity that is accepted always holds a sequence; a smaller one may not."""
 
     @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
     @pytest.mark.parametrize(("slice_len", "lookahead"), [(4, 0), (3, 2), (13, 0)])
-    def test_one_that_is_accepted_never_runs_out(self, sampling, slice_len, lookahead):
+    def test_an_accepted_capacity_always_holds_a_sequence(self, sampling, slice_len, lookahead):
         needed = 9 + (min(slice_len + lookahead, 9) if sampling == "whole_episodes" else slice_len + lookahead) - 1
         make = partial(
             make_sequence_buffer,
@@ -211,7 +211,7 @@ class TestRoomForStarts:
                     assert buffer.can_sample() or not buffer.is_full()
             assert buffer.is_full()
 
-    def test_with_one_step_less_there_is_none_at_times(self):
+    def test_a_capacity_of_one_step_less_sometimes_holds_no_sequence(self):
         buffer = make_sequence_buffer(11, slice_len=4, batch_size=1, num_envs=1, sampling="episode_starts")
         able = []
         for number in range(6):
@@ -220,7 +220,7 @@ class TestRoomForStarts:
                 able.append(buffer.can_sample())
         assert able[:4] == [False, False, False, True] and 0 < sum(not each for each in able[20:]) < 5
 
-    def test_nothing_is_asked_where_no_length_is_known_or_sequences_begin_anywhere(self):
+    def test_any_capacity_is_accepted_if_lengths_are_unknown_or_sequences_begin_anywhere(self):
         make_sequence_buffer(4, slice_len=4, batch_size=1, num_envs=1, sampling="episode_starts")
         make_sequence_buffer(4, slice_len=4, batch_size=1, num_envs=1, sampling="steps", episode_len=9)
 
@@ -255,7 +255,7 @@ class TestState:
     def make(self, sampling):
         return make_sequence_buffer(3 * 20, slice_len=4, batch_size=16, num_envs=3, sampling=sampling)
 
-    def test_a_copy_draws_and_stores_alike(self, sampling, batches):
+    def test_a_copy_of_a_memory_draws_and_stores_alike(self, sampling, batches):
         stream, first, second = Stream(3), self.make(sampling), self.make(sampling)
         second.extend(Stream(3).take(20))
         for _ in range(batches):
@@ -277,7 +277,7 @@ class TestState:
             first.extend(batch.clone())
             second.extend(batch.clone())
 
-    def test_a_state_is_as_large_as_what_was_stored(self, sampling, batches):
+    def test_the_state_of_a_memory_is_as_large_as_what_was_stored(self, sampling, batches):
         buffer, stream = self.make(sampling), Stream(3)
         for _ in range(batches):
             buffer.extend(stream.take(6))
@@ -285,7 +285,7 @@ class TestState:
         assert len(stored) == min(6 * batches, 20)
 
 
-def test_the_state_of_an_empty_memory():
+def test_the_state_of_an_empty_memory_is_restored():
     first, second = (make_sequence_buffer(60, slice_len=4, batch_size=4, num_envs=3) for _ in range(2))
     second.extend(Stream(3).take(10))
     second.load_state_dict(first.state_dict())
@@ -295,7 +295,7 @@ def test_the_state_of_an_empty_memory():
     assert len(second) == 24 and sample_sequences(second, 4).shape == (4, 4)
 
 
-def test_the_state_of_a_memory_of_options():
+def test_the_state_of_a_memory_of_options_is_restored():
     first, second = (make_sequence_buffer(10, slice_len=3, batch_size=16) for _ in range(2))
     for number in range(7):
         first.extend(one_episode(number, 1 + number % 3))
@@ -376,7 +376,7 @@ class TestEpisodeStarts:
             wrapped += recorder.now > recorder.rows
         assert wrapped >= 2
 
-    def test_they_run_on_into_the_next_episodes(self):
+    def test_slices_from_episode_starts_run_on_into_the_next_episodes(self):
         recorder = Recorder(3, 13)
         recorder.extend(40)
         sequences = recorder.sample()
@@ -398,8 +398,8 @@ class TestEpisodeStarts:
         assert ((counts - expected) ** 2 / expected).sum().item() < len(valid) + 6 * (2 * len(valid)) ** 0.5
 
     @pytest.mark.parametrize("lost", [1, 2, 7, 13])
-    def test_no_slice_goes_over_steps_that_were_lost(self, lost):
-        """Batches that never came join an episode to a later one that it did not lead to."""
+    def test_no_slice_spans_lost_steps(self, lost):
+        """Where batches are missing, an episode is followed by a later one that it did not lead to."""
         recorder, joined = Recorder(3, 6, rows=60), 0
         for number in range(24):
             if number % 3 == 2:
@@ -417,8 +417,8 @@ class TestEpisodeStarts:
             joined += len(recorder.valid_starts() - allowed)
         assert joined > 5
 
-    def test_an_episode_that_was_broken_off_joins_nothing(self):
-        """The collector started anew: the same numbers of episodes, and no end before a start."""
+    def test_an_interrupted_episode_is_not_joined_to_the_next(self):
+        """The collector started again: the same numbers of episodes, and no end before a start."""
         done = torch.zeros(6, 1, dtype=torch.bool)
         init, episode = torch.tensor([1, 0, 0, 1, 0, 0]).bool()[:, None], torch.zeros(6, 1)
         starts = episode_starts(init, episode, done, newest=5, length=3)
@@ -427,7 +427,7 @@ class TestEpisodeStarts:
         done[2] = True
         assert episode_starts(init, episode, done, newest=5, length=4).flatten().tolist() == [True] + [False] * 5
 
-    def test_without_a_start_that_has_enough_steps_it_says_what_to_do(self):
+    def test_without_a_start_with_enough_steps_an_error_says_what_to_do(self):
         recorder = Recorder(2, 12)
         recorder.extend(10)
         with pytest.raises(RuntimeError, match=r"slice_len=12 stored steps; update later, raise capacity or use"):
@@ -437,7 +437,7 @@ class TestEpisodeStarts:
 
 
 @pytest.mark.parametrize("sampling", [*PADDED, "episode_starts"])
-def test_a_memory_that_was_sampled_forgets_what_it_knew_when_another_is_loaded(sampling):
+def test_loading_a_memory_clears_the_caches_of_its_sampler(sampling):
     settings = {"slice_len": 4, "batch_size": 64, "num_envs": 2, "sampling": sampling}
     source, target = (make_sequence_buffer(40, **settings) for _ in range(2))
     stream = Stream(2)

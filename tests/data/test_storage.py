@@ -43,7 +43,7 @@ def drawn(buffer, seed):
 @every_sampling
 @pytest.mark.parametrize("capacity", [30, 32], ids="capacity {}".format)
 @pytest.mark.parametrize("length", [1, 4, 13], ids="batches of {}".format)
-def test_a_copy_goes_on_as_the_original_wherever_it_was_taken(sampling, priority_exponent, capacity, length):
+def test_a_copy_of_a_memory_of_steps_goes_on_as_the_original(sampling, priority_exponent, capacity, length):
     """Before, while and after the ring is full for the first time; copies of copies; draws, writes, priorities."""
     first, compared = make(capacity, sampling, priority_exponent), 0
     copies = []
@@ -79,7 +79,7 @@ def test_a_copy_of_a_memory_of_options_goes_on_as_the_original(capacity):
 
 
 @every_sampling
-def test_one_that_was_emptied_is_as_good_as_new(sampling, priority_exponent):
+def test_an_emptied_memory_is_as_good_as_new(sampling, priority_exponent):
     used, new = make(32, sampling, priority_exponent), make(32, sampling, priority_exponent)
     for batch in stream_of_batches(4, 5):
         used.extend(batch.clone())
@@ -97,7 +97,7 @@ def test_one_that_was_emptied_is_as_good_as_new(sampling, priority_exponent):
 
 
 class TestBatches:
-    def test_a_single_step_is_one(self):
+    def test_a_single_step_is_a_batch(self):
         one_by_one, at_once = make(60), make(60)
         for batch in stream_of_batches(1, 26):
             one_by_one.extend(batch.clone())
@@ -112,7 +112,7 @@ class TestBatches:
         }
 
     @every_sampling
-    def test_of_more_than_there_is_room_for_the_newest_stay_in_their_order(self, sampling, priority_exponent):
+    def test_of_too_many_steps_the_newest_are_kept_in_order(self, sampling, priority_exponent):
         buffer, batch = make(60, sampling, priority_exponent), Stream(3).take(53)
         buffer.extend(batch.clone())
         assert len(buffer) == 60 and (batch["step"][:, -20:] == buffer.storage[:]["step"].T).all()
@@ -120,7 +120,7 @@ class TestBatches:
         step, init = sample["step"], sample["is_init"].squeeze(-1)
         assert ((step[:, 1:] - step[:, :-1] <= 1) & ((step == 0) == init)[:, 1:]).all()
 
-    def test_of_too_many_options_the_newest_stay(self):
+    def test_of_too_many_options_the_newest_are_kept(self):
         buffer = make(10, num_envs=None)
         buffer.extend(one_episode(0, 3))
         buffer.extend(one_episode(1, 25))
@@ -136,7 +136,7 @@ class TestBatches:
             (None, lambda: Stream(3).take(4), r"the shape \[M\] that .*, got \[3, 4\]; "),
         ],
     )
-    def test_those_of_another_shape_are_refused_and_change_nothing(self, num_envs, batch, message):
+    def test_batches_of_another_shape_are_refused_and_change_nothing(self, num_envs, batch, message):
         buffer = make(60, num_envs=num_envs)
         with pytest.raises(ValueError, match=message):
             buffer.extend(batch())
@@ -165,30 +165,30 @@ class TestStatesThatAreRefused:
         ],
         ids=["capacity", "rows"],
     )
-    def test_one_of_another_size(self, saved, message):
+    def test_a_state_of_another_size_is_refused(self, saved, message):
         buffer = make(60)
         buffer.extend(Stream(3).take(9))
         self.refused(self.state(**saved), message, buffer)
 
     @pytest.mark.parametrize("newest", [-1, 9, 10**9])
-    def test_one_whose_newest_row_is_not_stored(self, newest):
+    def test_a_state_whose_newest_row_is_not_stored_is_refused(self, newest):
         state = self.state()
         state["_storage"]["last_cursor"] = newest
         self.refused(state, f"the newest among them, got 9 with the newest at {newest}; it is damaged", make(60))
 
     @pytest.mark.parametrize("cursor", [-1, 20, 10**9])
-    def test_one_that_goes_on_outside_of_the_ring(self, cursor):
+    def test_a_state_whose_next_row_lies_outside_the_ring_is_refused(self, cursor):
         state = self.state()
         state["_writer"]["_cursor"] = cursor
         self.refused(state, rf"next row must lie in \[0, 20\), got {cursor}; it is damaged", make(60))
 
-    def test_one_that_holds_more_than_its_rows(self):
+    def test_a_state_with_more_than_its_rows_is_refused(self):
         state = self.state(capacity=90)
         state["_storage"]["rows"] = 20
         state["_storage"]["stored"] = torch.cat([state["_storage"]["stored"]] * 3)
         self.refused(state, "must hold 1 to 20 rows, the newest among them, got 27", make(60))
 
-    def test_priorities_of_another_size_or_none_at_all(self):
+    def test_priorities_of_another_size_or_none_are_refused(self):
         good = self.state(priority_exponent=0.9)
         for name, value, message in (
             ("priorities", torch.ones(61), r"must be those of 60 steps, got \[61\] and \[60\]"),

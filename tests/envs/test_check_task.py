@@ -35,14 +35,14 @@ def missing(env):
 
 
 class Standing(Corridor):
-    """Attains an end in every step that it stands there."""
+    """Attains an end in every step that it stays there."""
 
     def _written(self, moved, *specs):
         return super()._written(torch.ones_like(moved), *specs)
 
 
 class Endless(Corridor):
-    """Its episodes are longer than it says."""
+    """Its episodes are longer than it states."""
 
     def _step(self, tensordict):
         after = super()._step(tensordict)
@@ -115,7 +115,7 @@ def test_the_grids_have_no_faults_and_no_gaps(env):
     assert check_task(env, steps=120) == []
 
 
-def test_a_whole_task_without_players_and_picture_does_without_a_ceiling_line():
+def test_a_complete_task_without_players_and_scene_has_two_gaps():
     assert wrong(corridor()) == []
     assert missing(corridor()) == {"no ceiling line", "watch.py shows observations as numbers"}
 
@@ -176,14 +176,14 @@ def test_environments_are_checked_through_transforms_and_batches():
     assert not [each for each in wrong(SerialEnv(3, lambda: Corridor(None, without=(), task=WHOLE))) if "seed" in each]
 
 
-def test_random_numbers_go_on_as_if_nothing_had_been_checked():
+def test_checking_does_not_affect_random_numbers():
     env = MultiGoalGridEnv(2, seed=0)
     before = torch.get_rng_state()
     check_task(env, steps=5)
     assert torch.equal(torch.get_rng_state(), before)
 
 
-def test_a_finding_reads_as_a_sentence():
+def test_a_finding_is_printed_with_its_severity_and_cost():
     finding = next(each for each in check_task(corridor(), steps=5) if "players" in each.what)
     assert str(finding) == "missing: there are no scripted players (no ceiling line)"
     with pytest.raises(ValueError, match="steps must be >= 1, got 0"):

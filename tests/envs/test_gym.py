@@ -18,7 +18,7 @@ RIGHT = 3
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("settings", [{}, {"num_goals": 3, "view": None, "obstacle": "teleport", "max_steps": 100}])
-def test_passes_the_checker_without_a_warning(env_id, settings):
+def test_gymnasiums_checker_gives_no_warning(env_id, settings):
     env = gymnasium.make(env_id, render_mode="rgb_array", **settings)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -36,7 +36,7 @@ def test_passes_the_checker_without_a_warning(env_id, settings):
     ],
     ids=["open", "rooms", "small", "nine_rooms"],
 )
-def test_equals_the_batched_environment_step_for_step(settings, obstacle):
+def test_the_gymnasium_environment_equals_the_batched_one_step_for_step(settings, obstacle):
     batched = MultiGoalGridEnv(1, seed=0, obstacle=obstacle, **settings)
     single = MultiGoalGymEnv(obstacle=obstacle, **settings)
     actions, steps = np.random.default_rng(0), 0
@@ -64,7 +64,7 @@ def test_equals_the_batched_environment_step_for_step(settings, obstacle):
             tensordict = tensordict.exclude("reward", "extrinsic_reward")
 
 
-def test_types():
+def test_observations_rewards_and_flags_have_the_types_of_gymnasium():
     env = MultiGoalGymEnv(view=3)
     observation, info = env.reset(seed=0)
     assert (observation.dtype, observation.shape) == (np.uint8, (3, 3))
@@ -74,7 +74,7 @@ def test_types():
     assert [type(info[key]) for key in ("extrinsic_reward", "hazard", "is_success")] == [float, bool, bool]
 
 
-def test_info_tells_obstacle_goals_and_success():
+def test_info_holds_obstacle_goals_and_success():
     env = MultiGoalGymEnv(**CORRIDOR)
     _, info = env.reset(options={"agent": 7, "objects": [8, 9, 10]})
     assert (info["extrinsic_reward"], info["hazard"], info["is_success"]) == (0, False, False)
@@ -113,7 +113,7 @@ def test_ids_have_their_layout_and_pass_arguments_on(env_id, layout):
     assert env.spec.to_json()
 
 
-def test_a_vector_of_environments():
+def test_environments_work_in_a_gymnasium_vector():
     envs = gymnasium.make_vec("hdrqn/Gridworld-v0", num_envs=2, vectorization_mode="sync")
     observation, _ = envs.reset(seed=0)
     assert observation.shape == (2, 5, 5)
@@ -136,7 +136,7 @@ def test_the_picture_shows_every_object_and_dims_what_the_agent_does_not_see():
     assert (picture[32 + 16, 32 + 16] == AGENT_COLOUR).all()
 
 
-def test_worlds_are_drawn_one_by_one_as_together():
+def test_a_world_is_drawn_alone_as_in_a_batch():
     rules = MultiGoalGridEnv(1, layout="four_rooms").rules
     state = rules.sample(3)
     pictures = draw_worlds(rules, state, cell_pixels=8)

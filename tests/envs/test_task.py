@@ -1,4 +1,4 @@
-"""What tasks tell about themselves."""
+"""What tasks state about themselves."""
 
 import math
 import pickle
@@ -19,7 +19,7 @@ def cart_pole(max_steps: int | None = 37) -> GymWrapper:
 
 
 class Counting(gymnasium.Env):
-    """A stock environment that has a ``task`` of its own, which is none of ours."""
+    """A stock environment with an unrelated attribute ``task``."""
 
     observation_space, action_space = gymnasium.spaces.Discrete(3), gymnasium.spaces.Discrete(2)
     task = "count"
@@ -42,7 +42,7 @@ class TestWhatIsFound:
         assert (task.smallest_extrinsic_return, task.largest_extrinsic_return) == (0.0, 3.0)
         assert task.ordered and task.ceiling == "memory" and task.actions == ("up", "down", "left", "right")
 
-    def test_a_task_that_says_nothing_is_unknown_in_everything(self):
+    def test_an_environment_without_a_statement_has_an_unknown_task(self):
         assert task_of(GymWrapper(Counting(), categorical_action_encoding=True)) == Task()
 
     @pytest.mark.parametrize("limit, expected", [(5, 5), (50, 9)])
@@ -50,7 +50,7 @@ class TestWhatIsFound:
         env = TransformedEnv(TransformedEnv(small_env(2, max_steps=9)), StepCounter(max_steps=limit))
         assert task_of(env).max_steps == expected
 
-    def test_a_step_counter_without_a_limit_says_nothing(self):
+    def test_a_step_counter_without_a_limit_changes_nothing(self):
         assert task_of(TransformedEnv(cart_pole(None), StepCounter())).max_steps == 500  # CartPole's own
 
     def test_rewards_that_a_transform_changes_are_unknown(self):
@@ -76,7 +76,7 @@ class TestWhatIsFound:
         assert (task.max_steps, task.largest_return) == (50, 3.0)
         assert torch.equal(torch.get_rng_state(), generator)
 
-    def test_it_travels_to_other_processes(self):
+    def test_a_task_can_be_pickled(self):
         task = task_of(small_env(2))
         assert pickle.loads(pickle.dumps(task)) == task
 

@@ -24,11 +24,11 @@ CASES = [
 
 @pytest.mark.parametrize(("wrong", "message"), CASES)
 class TestWhatIsWrong:
-    def test_at_once(self, wrong, message):
+    def test_a_fault_is_raised_at_once_on_a_cpu(self, wrong, message):
         with pytest.raises(NonFiniteError, match=f"^{message}$"):
             watch(FiniteGuard(at_once=True), **wrong)
 
-    def test_later(self, wrong, message):
+    def test_a_fault_is_raised_by_check_on_a_gpu(self, wrong, message):
         """Other updates before and after it change nothing."""
         guard = FiniteGuard(at_once=False)
         skips = [watch(guard, "update 0"), watch(guard, **wrong), watch(guard, "update 2"), watch(guard, loss=NAN)]
@@ -38,7 +38,7 @@ class TestWhatIsWrong:
                 guard.check()
 
 
-def test_all_is_well():
+def test_finite_numbers_raise_nothing():
     guard = FiniteGuard(at_once=True)
     assert watch(guard) is None
     guard.check()
@@ -59,7 +59,7 @@ def quiet_batch():
 class TestCheckBatch:
     @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
     @pytest.mark.parametrize("key", ["observation", ("next", "observation"), ("next", "reward"), ("sub_hidden")])
-    def test_it_names_the_entry_and_the_place(self, key, value):
+    def test_a_bad_batch_is_refused_with_entry_and_place(self, key, value):
         batch = quiet_batch()
         batch["observation"], batch["next", "observation"] = torch.zeros(2, 2, 5, 3)
         batch["sub_hidden"] = torch.zeros(2, 5, 4)
@@ -70,13 +70,13 @@ class TestCheckBatch:
         with pytest.raises(NonFiniteError, match=f"^{name} holds a NaN or an infinity, environment 1, after frame 50$"):
             check_batch(batch, 50)
 
-    def test_the_observation_is_named_before_what_follows_from_it(self):
+    def test_the_observation_is_named_before_entries_that_follow_from_it(self):
         batch = quiet_batch()
         batch["a"], batch["observation"] = torch.full((2, 2, 5), float("nan"))
         with pytest.raises(NonFiniteError, match=r"^observation holds"):
             check_batch(batch, 0)
 
-    def test_integers_and_flags_are_no_matter(self):
+    def test_integers_and_flags_are_ignored(self):
         batch = quiet_batch()
         batch["observation"] = torch.full((2, 5, 3), 255, dtype=torch.uint8)
         check_batch(batch, 0)

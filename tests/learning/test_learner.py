@@ -62,7 +62,7 @@ class TestUpdatesDue:
             (1_000, 1, 2, 0),
         ],
     )
-    def test_frames_after_warmup_over_the_ratio(self, warmup, frames_per_update, batches, due):
+    def test_updates_due_are_frames_after_warmup_over_the_ratio(self, warmup, frames_per_update, batches, due):
         learner = make_learner(warmup_frames=warmup, frames_per_update=frames_per_update)
         for _ in range(batches):
             learner.store(make_batch())
@@ -77,8 +77,8 @@ class TestUpdatesDue:
                 learner.learn()
         assert made == [0, 1, 1, 0, 1, 1] and learner.updates == 4 and learner.frames == 96
 
-    def test_the_count_begins_with_the_first_transition(self):
-        """Options come out with the first finished episode: what could not be learned until then is not made up for."""
+    def test_updates_due_are_counted_from_the_first_transition(self):
+        """Options come out with the first finished episode: updates missed until then are not made up for."""
         learner = make_learner(frames_per_update=16, extract=lambda batch: batch if learner.frames > 32 else None)
         due = []
         for _ in range(4):
@@ -86,7 +86,7 @@ class TestUpdatesDue:
             due.append(learner.updates_due())
         assert due == [0, 0, 1, 2]
 
-    def test_nothing_is_due_while_nothing_is_stored(self):
+    def test_no_updates_are_due_while_nothing_is_stored(self):
         learner = make_learner(extract=lambda batch: None)
         learner.store(make_batch())
         assert learner.frames == 16 and learner.updates_due() == 0
@@ -99,7 +99,7 @@ class TestWhatCanNotBeDrawnYet:
     @pytest.mark.parametrize(
         ("slice_len", "due"), [(3, [0, 2, 2, 2]), (5, [0, 0, 2, 2]), (6, [0, 0, 0, 2])], ids=lambda value: f"{value}"
     )
-    def test_nothing_is_due_until_it_can_and_nothing_is_made_up_for(self, priority_exponent, slice_len, due):
+    def test_no_updates_are_due_before_a_sequence_can_be_drawn(self, priority_exponent, slice_len, due):
         """Batches of two steps, updates after every four frames: two of each batch."""
         learner = make_learner(
             sampling="episode_starts", slice_len=slice_len, frames_per_update=2, priority_exponent=priority_exponent
@@ -112,7 +112,7 @@ class TestWhatCanNotBeDrawnYet:
                 learner.learn()
         assert found == due
 
-    def test_a_memory_that_loses_its_last_start_waits_says_so_once_and_goes_on(self):
+    def test_a_memory_that_loses_its_last_start_waits_with_one_warning_and_goes_on(self):
         """Episodes of eight steps in a memory of six for each environment: at times there is none of three."""
         learner = make_learner(sampling="whole_episodes", slice_len=2, frames_per_update=2, capacity=12)
         steps = make_batch(time=24)
@@ -136,7 +136,7 @@ class TestWhatCanNotBeDrawnYet:
             make_learner(sampling="episode_starts", slice_len=3, capacity=20, episode_len=8)
         make_learner(sampling="episode_starts", slice_len=3, capacity=22, episode_len=8)
 
-    def test_a_level_that_is_held_after_its_first_updates_makes_up_for_nothing(self):
+    def test_a_level_that_was_held_does_not_make_up_for_updates(self):
         learner, found = make_learner(frames_per_update=8), []
         for held in (False, True, True, False, False):
             learner.held = held
@@ -161,7 +161,7 @@ class TestEpisodesThatAreLongerThanASequence:
 
     @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
     @pytest.mark.parametrize("batch_len", [1, 3, 24])
-    def test_it_is_said_once_that_their_later_steps_are_never_learned_from(self, sampling, batch_len):
+    def test_episodes_longer_than_a_sequence_give_one_warning(self, sampling, batch_len):
         (said,) = self.warnings_of(sampling=sampling, slice_len=7, batch_len=batch_len)
         assert f"with sampling={sampling!r}, got 7 where one has more transitions; the later ones are never" in said
 
@@ -176,19 +176,19 @@ class TestEpisodesThatAreLongerThanASequence:
         ],
         ids=str,
     )
-    def test_nothing_is_said_where_all_steps_are_shown(self, settings):
+    def test_no_warning_is_given_where_all_steps_are_shown(self, settings):
         assert self.warnings_of(**settings) == []
 
 
 class TestUpdate:
-    def test_it_reduces_the_loss_on_a_fixed_sample(self):
+    def test_updates_reduce_the_loss_on_a_fixed_sample(self):
         learner = make_learner(learning_rate=1e-2, tau=1e-6)
         learner.store(make_batch())
         sample = learner.sample()
         losses = [learner.update(sample.clone())["loss"].item() for _ in range(60)]
         assert losses[-1] < 0.3 * losses[0] and learner.updates == 60
 
-    def test_it_moves_the_acting_network_and_the_target_follows_at_the_rate_tau(self):
+    def test_an_update_moves_the_acting_network_and_the_target_follows_at_the_rate_tau(self):
         learner = make_learner(tau=0.25, max_grad_norm=None)
         learner.store(make_batch())
         before = learner.loss.value_network_params.data.clone()
@@ -225,7 +225,7 @@ class TestUpdate:
             before == pytest.approx(same) and clipped == pytest.approx(1e-3, rel=1e-2) and whole == pytest.approx(same)
         )
 
-    def test_only_its_own_level_moves(self):
+    def test_an_update_moves_only_its_own_level(self):
         env = small_env(4)
         algorithm = build("v2", env)
         sub, meta = algorithm.learners["sub"], algorithm.learners["meta"]
@@ -276,7 +276,7 @@ class TestLongerTargets:
                 assert held == left.clamp(max=n_step).sum() and count <= slice_len
 
     @pytest.mark.parametrize("sampling", ["steps", "episodes"])
-    def test_the_last_steps_of_an_episode_are_trained_as_well(self, sampling):
+    def test_the_last_steps_of_an_episode_are_also_trained(self, sampling):
         _, found = self.rewards_held(n_step=5, slice_len=4, sampling=sampling, episode=20, num_batches=4)
         trained = torch.zeros(21)
         for _, count, row in found:
@@ -285,7 +285,7 @@ class TestLongerTargets:
                 trained[left] += 1
         assert (trained[1:] > 0).all()
 
-    def test_a_trace_reaches_beyond_the_sequence_too(self):
+    def test_a_trace_reaches_beyond_the_sequence(self):
         learner, found = self.rewards_held(trace_decay=0.8, slice_len=8)
         assert learner.sample().shape == (64, 8 + 4 + 1)
         inner = [held / count for held, count, row in found if row["left"].min() > 1 and not row["is_init"].any()]
@@ -293,7 +293,7 @@ class TestLongerTargets:
         # Values are equal, so that action 0 is the greedy one: each target holds 5 rewards or more.
         assert min(inner) >= weights[:5].sum() - 1e-4 and learner.settings.lookahead() == 4
 
-    def test_sequences_from_the_start_of_an_episode_have_none_for_a_trace(self):
+    def test_sequences_from_episode_starts_have_no_lookahead_for_a_trace(self):
         for sampling in ("episode_starts", "whole_episodes"):
             assert tiny_settings(trace_decay=0.8, sampling=sampling).lookahead() == 0
             assert tiny_settings(n_step=3, sampling=sampling).lookahead() == 2
@@ -304,7 +304,7 @@ class TestPriorities:
         with torch.no_grad():
             return learner.loss(sample)["priority"]
 
-    def test_an_update_writes_those_of_its_minibatch_and_of_no_other(self):
+    def test_an_update_sets_only_the_priorities_of_its_minibatch(self):
         """As they were before its gradient step, at the first steps of its sequences."""
         learner = make_learner(priority_exponent=1.0, slice_len=2, batch_size=3, learning_rate=0.5)
         learner.store(make_batch())
@@ -324,7 +324,7 @@ class TestPriorities:
         time, env = sample["index"][:, 0].unbind(-1)
         return learner.buffer.sampler.state_dict()["priorities"][time * 2 + env] - 1e-3
 
-    def test_what_has_been_learned_is_shown_less(self):
+    def test_learned_sequences_are_drawn_less_often(self):
         torch.manual_seed(0)
         learner = make_learner(priority_exponent=1.0, slice_len=4, batch_size=8, samples_per_draw=1)
         batch = make_batch(num_envs=2)
@@ -342,7 +342,7 @@ class TestPriorities:
         learner.update(sample)
         return sample["collector", "traj_ids"][:, 0]
 
-    def test_the_weights_reach_the_loss(self):
+    def test_importance_weights_reach_the_loss(self):
         losses = []
         for importance_exponent in (0.0, 1.0):
             learner = make_learner(
@@ -356,7 +356,7 @@ class TestPriorities:
             assert (sample["priority_weight"] == 1.0).all() == (importance_exponent == 0.0)
         assert losses[1]
 
-    def test_a_loss_that_reports_none_is_refused(self):
+    def test_a_loss_that_reports_no_priority_is_refused(self):
         learner = make_learner()
         learner.loss.out_keys = ["loss"]
         with pytest.raises(ValueError, match="priority_exponent must be None for RecurrentDQNLoss, which reports no"):
@@ -366,7 +366,7 @@ class TestPriorities:
 
 
 class TestLearningRate:
-    def test_it_falls_linearly_and_then_stays(self):
+    def test_the_learning_rate_falls_linearly_and_then_stays(self):
         learner = make_learner(learning_rate=1e-2, learning_rate_end=2e-3, learning_rate_frames=64)
         rates = [learner.learning_rate]
         for _ in range(5):
@@ -375,7 +375,7 @@ class TestLearningRate:
             assert learner.optimizer.param_groups[0]["lr"] == learner.learning_rate
         assert rates == pytest.approx([1e-2, 8e-3, 6e-3, 4e-3, 2e-3, 2e-3])
 
-    def test_it_stays_constant_without_an_end(self):
+    def test_the_learning_rate_is_constant_without_an_end(self):
         learner = make_learner(learning_rate=1e-2, learning_rate_end=None, learning_rate_frames=16)
         learner.store(make_batch())
         assert learner.learning_rate == learner.optimizer.param_groups[0]["lr"] == 1e-2
@@ -402,7 +402,7 @@ class TestSample:
         assert (first["observation"] != second["observation"]).any()
 
     @pytest.mark.parametrize("slice_len", [1, 4])
-    def test_it_has_the_shape_of_the_settings(self, slice_len):
+    def test_a_sample_has_the_shape_of_the_settings(self, slice_len):
         learner = make_learner(slice_len=slice_len, batch_size=7)
         learner.store(make_batch())
         assert learner.sample().shape == (7, slice_len + 1)
@@ -440,11 +440,11 @@ class TestSettings:
             tiny_settings(**{name: value})
 
     @pytest.mark.parametrize("sampling", ["episode_starts", "whole_episodes"])
-    def test_states_that_are_zero_are_not_stored(self, sampling):
+    def test_stored_state_is_refused_where_the_state_is_zero(self, sampling):
         with pytest.raises(ValueError, match=f"stored_state must be False with sampling='{sampling}', got True; "):
             tiny_settings(sampling=sampling, stored_state=True)
 
-    def test_the_beginning_of_episodes_cannot_be_left_out_for_good(self):
+    def test_settings_that_never_train_the_first_steps_are_refused(self):
         settings = {"sampling": "episode_starts", "train_exact_states": False}
         with pytest.raises(ValueError, match=r"with burn_in=0.5 and sampling='episode_starts', got False; "):
             tiny_settings(**settings)
@@ -459,7 +459,7 @@ class TestSettings:
             ("sampling", "rows", "sampling must be 'steps', 'episodes', .* or 'whole_episodes', got 'rows'; "),
         ],
     )
-    def test_wrong_values_that_concern_its_parts(self, name, value, message):
+    def test_wrong_settings_of_memory_and_loss_are_refused(self, name, value, message):
         with pytest.raises(ValueError, match=message):
             make_learner(**{name: value})
 
@@ -502,11 +502,11 @@ class TestSettings:
             ({"trace_decay": 0.5, "slice_len": 1}, "slice_len must be > 1 where trace_decay > 0, got 1; "),
         ],
     )
-    def test_lengths_of_targets_that_contradict_each_other(self, changes, message):
+    def test_contradictory_lengths_of_targets_are_refused(self, changes, message):
         with pytest.raises(ValueError, match=message):
             tiny_settings(**changes)
 
-    def test_sampling_reaches_the_memory(self):
+    def test_the_memory_uses_the_sampling_of_the_settings(self):
         samplers = {type(make_learner(sampling=kind).buffer.sampler) for kind in ("steps", "episodes")}
         assert len(samplers) == 2
 
@@ -541,7 +541,7 @@ def stored_twice():
 
 class TestState:
     @pytest.mark.parametrize("priority_exponent", [None, 0.9])
-    def test_a_copy_goes_on_alike(self, priority_exponent):
+    def test_a_copy_of_a_learner_continues_alike(self, priority_exponent):
         """In the middle of the minibatches of one draw, after a first transition that came late."""
         settings = {
             "learning_rate": 0.05,
@@ -586,7 +586,7 @@ class TestState:
             learner.load_state_dict(state)
         assert learner.updates_due() == 1
 
-    def test_more_updates_than_a_training_can_owe_are_refused(self):
+    def test_a_state_with_too_few_updates_is_refused(self):
         learner = stored_twice()
         state = deepcopy(learner.state_dict()) | {"frames": 10**12}
         with pytest.raises(ValueError, match="updates must make up for its frames, got 0 for 1000000000000"):
@@ -616,7 +616,7 @@ def test_a_network_with_convolutions_learns_on_as_if_it_had_not_been_saved(tmp_p
 
 class TestShapes:
     def test_all_of_a_batch_is_stored_from_the_devices_of_the_learner(self):
-        """TorchRL's Collector leaves the numbers of episodes on the host unless it is told a device."""
+        """TorchRL's Collector leaves the numbers of episodes on the host unless it is given a device."""
         learner, seen = make_learner(), []
         extract, learner.extract = learner.extract, lambda batch: extract(seen.append(batch.device) or batch)
         learner.store(make_batch())
@@ -656,19 +656,19 @@ class TestNumbersThatAreNone:
 
     @pytest.mark.parametrize(("value", "shown"), [(float("nan"), "nan"), (float("inf"), "(inf|nan)")])
     @pytest.mark.parametrize("max_grad_norm", [None, 1.0])
-    def test_a_loss(self, value, shown, max_grad_norm):
+    def test_a_loss_of_nan_stops_the_update(self, value, shown, max_grad_norm):
         learner, sample = self.poisoned(max_grad_norm=max_grad_norm)
         sample["next", "reward"].fill_(value)
         self.check_nothing_was_learned(learner, sample, f"^the loss became {shown} in update 2, frame 16$")
 
-    def test_a_gradient(self):
+    def test_a_gradient_of_nan_stops_the_update(self):
         learner, sample = self.poisoned()
         name, parameter = list(learner.network.named_parameters())[-1]
         parameter.register_hook(lambda gradient: gradient * float("nan"))
         message = f"^the gradient of {name} became NaN or infinite in update 2, frame 16$"
         self.check_nothing_was_learned(learner, sample, message.replace(".", r"\."))
 
-    def test_a_norm_of_gradients_that_are_numbers(self):
+    def test_an_infinite_norm_of_finite_gradients_stops_the_update(self):
         learner, sample = self.poisoned(max_grad_norm=1.0)
         for parameter in learner.network.parameters():
             parameter.register_hook(lambda gradient: torch.full_like(gradient, 3e38))
@@ -676,7 +676,7 @@ class TestNumbersThatAreNone:
 
 
 class TestSeparateParts:
-    """Parts of a network that are optimised apart."""
+    """Parts of a network that are optimised separately."""
 
     def updated(self, separate, **settings):
         """Which share of a parameter's first step each part made, and the gradients it was made with."""
@@ -688,13 +688,13 @@ class TestSeparateParts:
         steps = {name: (p - before[name]).abs().max().item() for name, p in learner.network.named_parameters()}
         return steps, metrics, {name: p.grad for name, p in learner.network.named_parameters()}
 
-    def test_each_has_its_rate(self):
+    def test_each_separate_part_has_its_rate(self):
         """Adam's first step is as long as its rate."""
         steps, _, _ = self.updated({"network.head": 0.25}, learning_rate=0.01)
         for name, step in steps.items():
             assert step == pytest.approx(0.0025 if "head" in name else 0.01, rel=1e-3)
 
-    def test_rates_follow_the_schedule(self):
+    def test_rates_of_separate_parts_follow_the_schedule(self):
         schedule = {"learning_rate": 0.01, "learning_rate_end": 0.001, "learning_rate_frames": 16}
         learner = make_learner(separate={"network.head": 0.5}, **schedule)
         rates = [group["lr"] for group in learner.optimizer.param_groups]
@@ -702,7 +702,7 @@ class TestSeparateParts:
         rates += [group["lr"] for group in learner.optimizer.param_groups]
         assert rates == pytest.approx([0.01, 0.005, 0.001, 0.0005])
 
-    def test_each_is_clipped_by_its_own_norm(self):
+    def test_each_separate_part_is_clipped_by_its_own_norm(self):
         _, metrics, together = self.updated(None, max_grad_norm=1e-3)
         _, same, apart = self.updated({"network.head": 1.0}, max_grad_norm=1e-3)
         assert metrics["grad_norm"] == same["grad_norm"] > 1e-3
@@ -714,7 +714,7 @@ class TestSeparateParts:
         assert norm(apart, True) == pytest.approx(1e-3, rel=1e-2) == norm(apart, False)
 
     @pytest.mark.parametrize("separate", [{"network.haed": 1.0}, {"network.head": 0.0}], ids=str)
-    def test_wrong_values(self, separate):
+    def test_wrong_separate_parts_are_refused(self, separate):
         with pytest.raises(ValueError, match="separate must map prefixes of parameters' names to shares > 0"):
             make_learner(separate=separate)
 
@@ -731,7 +731,7 @@ class TestNumbersThatAreNoneOnAGPU:
         sample["next", "reward"].fill_(float("nan"))
         return learner, sample
 
-    def test_no_update_reaches_the_weights_from_then_on(self):
+    def test_no_later_update_reaches_the_weights_on_a_gpu(self):
         learner, sample = self.poisoned()
         states = learner.optimizer.state.values()
         before = [value.clone() for value in learner.network.parameters()]
@@ -742,7 +742,7 @@ class TestNumbersThatAreNoneOnAGPU:
             assert [value.tolist() for state in states for value in state.values()] == [v.tolist() for v in moments]
 
     @pytest.mark.parametrize("look", ["check_finite", "state_dict", "store"])
-    def test_the_host_hears_of_it(self, look):
+    def test_check_finite_reports_a_nan_on_a_gpu(self, look):
         learner, sample = self.poisoned()
         learner.update(sample)
         learner.learn()
@@ -750,7 +750,7 @@ class TestNumbersThatAreNoneOnAGPU:
         with pytest.raises(NonFiniteError, match=r"^the loss became nan in update 2, frame 16$"):
             getattr(learner, look)(*arguments)
 
-    def test_sound_updates_are_those_of_a_cpu(self):
+    def test_finite_updates_on_a_gpu_equal_those_on_a_cpu(self):
         learners = [make_learner(max_grad_norm=1.0, learning_rate=0.1) for _ in range(2)]
         learners[1].guard.at_once = False
         torch.manual_seed(1)
@@ -768,20 +768,20 @@ class TestPrecision:
         monkeypatch.setattr(learner_module, "choose_precision", lambda wanted, _: {"auto": choice}.get(wanted, wanted))
         return make_learner(extract=Keep(), **settings)
 
-    def test_what_auto_chose_is_kept_on_another_machine(self, monkeypatch):
+    def test_the_precision_that_auto_chose_is_kept_on_another_machine(self, monkeypatch):
         first = self.chosen(monkeypatch, "bf16", precision="auto")
         second = self.chosen(monkeypatch, "fp32", precision="auto")
         assert (first.precision, second.precision) == ("bf16", "fp32")
         second.load_state_dict(first.state_dict())
         assert second.precision == "bf16"
 
-    def test_an_explicit_one_is_kept_in_any_case(self, monkeypatch):
+    def test_an_explicit_precision_is_kept(self, monkeypatch):
         first = self.chosen(monkeypatch, "bf16", precision="auto")
         second = make_learner(extract=Keep(), precision="fp32")
         second.load_state_dict(first.state_dict())
         assert second.precision == "fp32"
 
-    def test_a_state_from_before_there_was_a_choice(self, monkeypatch):
+    def test_a_state_older_than_the_precision_setting_stays_in_fp32(self, monkeypatch):
         state = make_learner(extract=Keep()).state_dict()
         del state["precision"]
         second = self.chosen(monkeypatch, "bf16", precision="auto")

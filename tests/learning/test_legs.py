@@ -35,7 +35,7 @@ EPISODE = [
 ]
 
 
-def test_options_by_origin_and_target():
+def test_options_are_counted_by_origin_and_target():
     legs = LegCounter(2)
     legs.observe(batch(*EPISODE))
     assert legs.options.tolist() == [[0, 2], [1, 0], [1, 0]]
@@ -43,7 +43,7 @@ def test_options_by_origin_and_target():
     assert legs.rates[0, 1] == 0.5 and math.isnan(legs.rates[1, 1])
 
 
-def test_a_new_episode_begins_at_the_start_or_where_it_says():
+def test_an_episode_begins_at_the_start_or_at_the_subgoal_of_its_reset():
     legs = LegCounter(2)
     legs.observe(batch(*EPISODE))
     legs.clear()
@@ -51,13 +51,13 @@ def test_a_new_episode_begins_at_the_start_or_where_it_says():
     assert legs.options.tolist() == [[0, 1], [0, 0], [0, 1]]
 
 
-def test_an_option_begins_where_it_began_whatever_it_passes():
+def test_the_origin_of_an_option_does_not_change_on_its_way():
     legs = LegCounter(2)
     legs.observe(batch((True, None, True, 1, 0, False), (False, None, False, 1, 1, True)))
     assert legs.reached.tolist() == [[0, 0], [0, 0], [0, 1]]
 
 
-def test_batches_may_be_cut_anywhere_and_its_state_goes_on():
+def test_batches_can_be_cut_anywhere_and_a_state_carries_the_counts():
     whole, cut = LegCounter(2), LegCounter(2)
     whole.observe(batch(*EPISODE))
     for step in EPISODE:
@@ -68,7 +68,7 @@ def test_batches_may_be_cut_anywhere_and_its_state_goes_on():
     assert (cut.options == whole.options).all() and (cut.reached == whole.reached).all()
 
 
-def test_its_columns_are_shares_by_name_and_a_new_row_counts_anew():
+def test_columns_of_legs_are_shares_and_a_new_row_counts_from_zero():
     legs = LegCounter(2)
     legs.observe(batch(*EPISODE))
     metrics = legs.metrics()

@@ -23,7 +23,7 @@ class TestVisitCounter:
         visits.observe(batch((FIRST, False), (FIRST, True), (NONE, True), (BOTH, False)))
         assert self.columns(visits) == [0.5, 1.0, 0.0, 0.0]
 
-    def test_a_new_row_forgets_what_ended_and_keeps_what_goes_on(self):
+    def test_a_new_row_forgets_episodes_that_ended_and_keeps_those_in_progress(self):
         visits = VisitCounter()
         visits.observe(batch((FIRST, True), (BOTH, False)))
         visits.clear()
@@ -31,7 +31,7 @@ class TestVisitCounter:
         visits.observe(batch((FIRST, True)))
         assert self.columns(visits) == [1.0, 2.0, 1.0, 1.0]
 
-    def test_its_state_goes_on(self):
+    def test_a_restored_visit_counter_continues(self):
         visits, other = VisitCounter(), VisitCounter()
         visits.observe(batch((BOTH, True), (FIRST, False)))
         other.load_state_dict(visits.state_dict())

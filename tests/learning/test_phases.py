@@ -60,7 +60,7 @@ class TestPhases:
         assert (other.phase, other.frames, other.success.rates.tolist()) == (2, 4, [0.5, 0.5])
         assert not exploration.held
 
-    def test_metrics_tell_phase_and_success(self):
+    def test_metrics_hold_phase_and_success(self):
         phases, _ = self.make()
         assert math.isnan(phases.metrics()["phase/success_1"])  # no option has ended yet
         phases.observe(options(True, False))
@@ -81,7 +81,7 @@ class TestPhases:
 
 
 @pytest.mark.parametrize(("name", "expected"), [("v2", [0, 0, 10]), ("v3", [10, 20, 30])])
-def test_algorithms_have_phases_if_asked_for(name, expected):
+def test_algorithms_have_phases_on_request(name, expected):
     env = small_env()
     assert build(name, env, settings=tiny_settings()).monitors == {}
     algorithm = build(name, env, settings=tiny_settings(), phase_one=PhaseOne(max_frames=200))

@@ -14,7 +14,7 @@ from hdrqn_torchrl.modules.q_network import ExactLinear
 
 @pytest.fixture
 def hardware(monkeypatch):
-    """Says what multiplies bfloat16: kinds of devices."""
+    """Sets the kinds of devices that multiply bfloat16."""
 
     def hardware(*kinds):
         monkeypatch.setattr(precision_module, "multiplies_bfloat16", lambda kind: kind in kinds)
@@ -35,32 +35,32 @@ class TestChoice:
             ([], LARGE, "fp32"),
         ],
     )
-    def test_auto(self, kinds, network, chosen, hardware):
+    def test_auto_takes_bf16_where_hardware_and_network_gain(self, kinds, network, chosen, hardware):
         hardware(*kinds)
         assert choose_precision("auto", network) == chosen
 
     @pytest.mark.parametrize("wanted", ["fp32", "bf16"])
-    def test_an_explicit_one_is_taken(self, wanted, hardware):
+    def test_an_explicit_precision_is_taken(self, wanted, hardware):
         hardware("cpu")
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             assert choose_precision(wanted, SMALL) == wanted
 
-    def test_bf16_on_a_cpu_without_it_is_slow(self, hardware):
+    def test_bf16_on_a_cpu_without_amx_warns(self, hardware):
         hardware()
         with pytest.warns(UserWarning, match="precision='bf16' is slow on a CPU without AMX; "):
             assert choose_precision("bf16", LARGE) == "bf16"
 
-    def test_bf16_on_another_device_without_it_is_refused(self, hardware):
+    def test_bf16_on_a_gpu_that_lacks_it_is_refused(self, hardware):
         hardware("cpu")
         with pytest.raises(ValueError, match=r"precision must be 'fp32' or 'auto' on this device \(meta\), which"):
             choose_precision("bf16", LARGE.to("meta"))
 
-    def test_an_unknown_one_is_refused(self):
+    def test_an_unknown_precision_is_refused(self):
         with pytest.raises(ValueError, match="precision must be 'auto', 'fp32' or 'bf16', got 'fp16'; "):
             choose_precision("fp16", SMALL)
 
-    def test_which_networks_gain(self):
+    def test_networks_with_convolutions_or_large_lstms_gain(self):
         env = small_env()
         for name in ALGORITHMS:
             small, large = build(name, env, compact_network()), build(name, env, paper_network())
@@ -73,13 +73,13 @@ class TestChoice:
 
 class TestMatrixProducts:
     @pytest.mark.parametrize(("precision", "dtype"), [("fp32", torch.float32), ("bf16", torch.bfloat16)])
-    def test_what_is_lowered(self, precision, dtype):
+    def test_only_matrix_products_are_lowered(self, precision, dtype):
         with matrix_products(precision, "cpu"):
             assert nn.Linear(2, 3)(torch.ones(1, 2)).dtype == dtype
             assert ExactLinear(2, 3)(torch.ones(1, 2, dtype=dtype)).dtype == torch.float32
         assert not torch.is_autocast_enabled("cpu")
 
-    def test_a_weight_first_read_without_gradient_keeps_its_own(self):
+    def test_a_weight_first_read_without_gradient_keeps_its_gradient(self):
         layer = nn.Linear(2, 3)
         with matrix_products("bf16", "cpu"):
             with torch.no_grad():
@@ -139,7 +139,7 @@ def test_everything_that_is_kept_is_fp32(twins):
 
 
 def test_values_that_differ_by_little_are_not_rounded_to_the_same(twins):
-    """At 1 a bfloat16 would go in steps of 0.008: what is greedy in learning must not be decided by ties."""
+    """Near 1 a bfloat16 has steps of 0.008: greedy choices in learning must not be decided by ties."""
     learner = next(iter(twins["bf16"].learners.values()))
     seen = []
     hooks = [

@@ -36,7 +36,7 @@ def as_before(state, *inputs):
         ("drqn", "flat", ("observation",)),
     ],
 )
-def test_they_are_left_out_with_a_warning_and_the_rest_is_loaded(name, level, inputs):
+def test_memories_of_earlier_versions_are_left_out_with_a_warning_and_the_rest_is_loaded(name, level, inputs):
     learner = filled(name).learners[level]
     state = as_before(deepcopy(learner.state_dict()), *inputs)
     successor = build(name, small_env(4)).learners[level]
@@ -48,7 +48,7 @@ def test_they_are_left_out_with_a_warning_and_the_rest_is_loaded(name, level, in
 
 
 @pytest.mark.parametrize("name", ["drqn", "v1", "v2", "v3"])
-def test_memories_of_today_are_loaded_whole(name):
+def test_current_memories_are_loaded_whole(name):
     for level, learner in filled(name).learners.items():
         successor = build(name, small_env(4)).learners[level]
         with warnings.catch_warnings():
@@ -57,11 +57,11 @@ def test_memories_of_today_are_loaded_whole(name):
         assert len(successor.buffer) == len(learner.buffer) > 0
 
 
-def test_an_empty_memory_holds_nothing_twice():
+def test_an_empty_memory_is_not_taken_for_an_earlier_one():
     assert not holds_inputs_twice({"_storage": {"stored": None}}, ["observation"])
 
 
-def test_options_in_progress_of_those_versions_are_forgotten():
+def test_options_in_progress_of_earlier_versions_are_forgotten():
     extract = filled().learners["meta"].extract
     state = deepcopy(extract.state_dict())
     state["held"] = state["held"].exclude("over")

@@ -376,7 +376,7 @@ def test_epsilon_reaches_the_workers_with_the_weights():
 
 
 class TestMiddleController:
-    """A controller between two others: told a subgoal, with a memory that begins anew where that was chosen."""
+    """A controller between two others: it reads a subgoal, and its memory restarts where that was chosen."""
 
     def make(self):
         names = {"condition_key": "goal", "init_key": "goal_init", "mask_key": None}

@@ -61,7 +61,7 @@ def targets(
         # An exploratory action: the target before it takes the value only.
         ({"actions": "001"}, [3.0, 4.0, 5.0]),
         ({"actions": "010"}, [3.0, 3.25, 5.0]),
-        ({"actions": "100"}, [2.8125, 3.25, 5.0]),  # one's own action may be any
+        ({"actions": "100"}, [2.8125, 3.25, 5.0]),  # the first action may be any
         # An option that terminates in the middle: y1 = 0; y0 = 1 + 0.5 * (0.5 * 4 + 0.5 * 0).
         ({"done": "010", "terminated": "010", "init": "001"}, [2.0, 0.0, 5.0]),
         ({"done": "001", "terminated": "001"}, [1 + 0.5 * (2 + 0.5 * 2.5), 0.5 * (4 + 0.5 * 2), 2.0]),

@@ -61,7 +61,7 @@ def test_levels_have_names_and_notes_on_duration_and_random_choice():
     assert [level.symbol for level in levels_of(walk("drqn")[0], BarSpans())] == ["Q"]
 
 
-def test_captions_tell_what_happened_in_a_step():
+def test_captions_say_what_happened_in_a_step():
     assert [caption(frame) for frame in walk("v2", wants=FIRST_GOAL)] == [
         "chooses goal 1",
         "obstacle hit",

@@ -109,7 +109,7 @@ def test_text_shows_the_same_world_as_the_picture():
     assert scene_of(room).write_world().plain.splitlines()[1:4] == ["██ @ ·  ██", "██ · ·  ██", "██     1██"]
 
 
-def test_names_of_choices_and_of_ends_of_episodes():
+def test_choices_and_ends_of_episodes_have_names():
     scene = scene_of(corridor())
     assert scene.subgoal_names == ("goal 1", "goal 2")
     assert [list(colour) for colour in scene.subgoal_colours] == [GOAL_1, GOAL_2]
@@ -139,7 +139,7 @@ def test_an_environment_that_renders_nothing_is_shown_in_numbers():
     assert scene_of(Corridor(1)).write_view().plain == "no picture"
 
 
-def test_what_an_environment_renders_is_its_world():
+def test_the_world_of_an_environment_is_what_it_renders():
     scene = scene_of(Pictured(1))
     picture = pixels(scene.draw_world(100))
     assert picture.shape == (40, 100, 3) and (picture[0, 45] == [255, 0, 0]).all() and (picture[0, 5] == 255).all()

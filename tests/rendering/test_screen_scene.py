@@ -17,14 +17,14 @@ def frames():
     return record_episodes(agent.transform(env), agent, epsilon=1.0)
 
 
-def test_frames_can_be_drawn(frames):
+def test_frames_of_the_screen_can_be_drawn(frames):
     assert draw_frame(frames[0]).shape == (456, 760, 3)
     assert frames[-1].outcome in ("died", "time is up")
     assert (draw_frame(frames[0]) != draw_frame(frames[3])).any()
     draw_text(frames[0])
 
 
-def test_names_of_subgoals_and_actions(frames):
+def test_subgoals_and_actions_of_the_screen_have_readable_names(frames):
     scene = frames[0].scene
     assert scene.subgoal_names[:4] == ("middle ladder, foot", "right ladder, foot", "left ladder, foot", "key")
     assert len(scene.action_names) == 18 and scene.action_names[11] == "jump →"

@@ -141,7 +141,7 @@ def test_a_task_without_a_scene_shows_what_the_agent_sees():
     assert (draw_frame(frames[0]) != draw_frame(frames[-1])).any()
 
 
-def test_an_agent_that_tells_no_levels_is_refused():
+def test_an_agent_that_names_no_levels_is_refused():
     env = MultiGoalGridEnv(1)
     agent = Algorithm(policy=Scripted(), learners={}, explorations={}, make_transforms=copies_of(SubgoalTransform(2)))
     with pytest.raises(ValueError, match="algorithm must name its levels to be watched, got none; "):

@@ -34,12 +34,12 @@ def book_env(num_envs=4):
 
 @pytest.mark.parametrize("make", [critic_env, book_env])
 class TestAttained:
-    def test_it_holds_the_verdict(self, make):
+    def test_attained_holds_the_verdict_of_the_critic(self, make):
         torch.manual_seed(0)
         after = make(16).rollout(40, break_when_any_done=False)["next"]
         assert after["attained"].any() and torch.equal(after["attained"], after["collected"].flip(-1))
 
-    def test_specs(self, make):
+    def test_the_specs_of_a_critic_are_right(self, make):
         check_env_specs(make())
         check_env_specs(SerialEnv(2, make))
 
@@ -53,7 +53,7 @@ class TestAttained:
 
 
 @pytest.mark.parametrize("transform", [partial(Critic, 2), lambda verdict: SubgoalTransform(2, critic=verdict)])
-def test_what_the_environment_has_there_is_replaced(transform):
+def test_the_critic_replaces_the_entry_of_the_environment(transform):
     base = MultiGoalGridEnv(1, layout=CORRIDOR, num_obstacles=1, seed=0)
     env = TransformedEnv(base, transform(lambda after: after["attained"].flip(-1)))
     td = env.reset().set("subgoal", torch.zeros(1, dtype=torch.int64)).set("action", torch.tensor([RIGHT]))

@@ -1,4 +1,4 @@
-"""Two option books side by side, on random streams, against plain loops over Python numbers."""
+"""Two option books at once, on random streams, against plain loops over Python numbers."""
 
 from functools import partial
 
@@ -118,16 +118,16 @@ def test_two_books_agree_with_plain_loops(near):
 
 
 class TestSpecs:
-    def test_alone(self):
+    def test_the_specs_of_two_books_are_right(self):
         check_env_specs(make_env())
 
-    def test_inside_serial_env(self):
+    def test_the_specs_of_two_books_are_right_inside_a_serial_env(self):
         check_env_specs(SerialEnv(2, make_env))
 
-    def test_around_serial_env(self):
+    def test_the_specs_of_two_books_are_right_around_a_serial_env(self):
         check_env_specs(TransformedEnv(SerialEnv(2, partial(Stream, 3)), Compose(InitTracker(), *books())))
 
-    def test_inside_parallel_env(self):
+    def test_the_specs_of_two_books_are_right_inside_a_parallel_env(self):
         env = ParallelEnv(2, make_env, mp_start_method="fork")
         try:
             steps = env.rollout(20, break_when_any_done=False)

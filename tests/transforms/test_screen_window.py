@@ -73,7 +73,7 @@ def test_specs_of_an_environment_with_a_window():
 
 
 class TestInterpolated:
-    """On a GPU there is no kernel for bytes; the same numbers come out of matrix products."""
+    """On a GPU there is no kernel for bytes; matrix products give the same numbers."""
 
     SIDES = ((70, 70), (210, 160), (44, 44), (44, 70), (30, 33), (5, 7), (1, 9), (100, 3), (88, 88), (45, 43))
 

@@ -34,7 +34,7 @@ def column(steps, key):
 
 
 class TestNumbers:
-    def test_an_option_that_reaches_its_subgoal(self):
+    def test_the_book_of_an_option_that_reaches_its_subgoal(self):
         steps = play([0, 0, 1], gamma=0.5)
         assert column(steps, "intrinsic_reward") == [-1.0, 1.0, 1.0]
         assert column(steps, "option_steps") == [1, 2, 1]
@@ -44,7 +44,7 @@ class TestNumbers:
         assert column(steps, "option_terminated") == [0, 1, 1]
         assert [step["subgoal_mask"].tolist() for step in steps] == [[[True, True]], [[False, True]], [[False, False]]]
 
-    def test_an_option_that_passes_over_another_goal(self):
+    def test_the_book_of_an_option_that_passes_over_another_goal(self):
         steps = play([1, 1, 1], gamma=0.5)
         assert column(steps, "intrinsic_reward") == [-1.0, 0.0, 1.0]
         assert column(steps, "option_steps") == [1, 2, 3]
@@ -114,7 +114,7 @@ class TestArguments:
             ({"critic": lambda after: after["attained"].flip(-1)}, "subgoal_reached", [0, 1, 0]),
         ],
     )
-    def test_with_subgoal_1(self, settings, key, expected):
+    def test_every_argument_of_the_book_changes_its_numbers(self, settings, key, expected):
         assert column(play([1, 1, 1], **settings), key) == pytest.approx(expected)
 
     @pytest.mark.parametrize(("repeatable", "done"), [(False, 1), (True, 0)])
@@ -123,7 +123,7 @@ class TestArguments:
         assert steps[-1]["option_done"].item() == done
         assert steps[-1]["subgoal_mask"].tolist() == [[repeatable, True]]
 
-    def test_reaching_the_subgoal_is_no_wrong_subgoal(self):
+    def test_reaching_the_subgoal_is_not_penalised_as_a_wrong_one(self):
         assert column(play([0, 0], wrong_subgoal_reward=-0.5), "intrinsic_reward") == [-1.0, 1.0]
 
     @pytest.mark.parametrize(
@@ -141,20 +141,20 @@ class TestArguments:
 
 class TestSpecs:
     @pytest.mark.parametrize("num_envs", [1, 4])
-    def test_alone(self, num_envs):
+    def test_the_specs_of_the_book_are_right(self, num_envs):
         check_env_specs(subgoal_env(num_envs))
 
-    def test_inside_serial_env(self):
+    def test_the_specs_of_the_book_are_right_inside_a_serial_env(self):
         check_env_specs(SerialEnv(2, lambda: subgoal_env(3)))
 
-    def test_around_serial_env(self):
+    def test_the_specs_of_the_book_are_right_around_a_serial_env(self):
         env = TransformedEnv(SerialEnv(2, lambda: small_env(3)), SubgoalTransform(num_subgoals=2))
         check_env_specs(env)
         rollout = env.rollout(30, break_when_any_done=False)
         assert rollout.batch_size == (2, 3, 30)
         assert rollout["next", "option_done"][rollout["next", "done"]].all()
 
-    def test_inside_and_around_parallel_env(self):
+    def test_the_specs_of_the_book_are_right_inside_and_around_a_parallel_env(self):
         inside = ParallelEnv(2, partial(subgoal_env, 3), mp_start_method="fork")
         around = TransformedEnv(
             ParallelEnv(2, partial(small_env, 3), mp_start_method="fork"), SubgoalTransform(num_subgoals=2)
@@ -209,7 +209,7 @@ class TestAlongEpisodes:
         assert init[:, 0].all()
         assert (init[:, 1:] == done[:, :-1]).all()
 
-    def test_steps_count_from_one(self, rollout):
+    def test_steps_of_an_option_count_from_one(self, rollout):
         init, steps = rollout["option_init"], rollout["next", "option_steps"]
         assert (steps[init] == 1).all()
         assert (steps[:, 1:] == steps[:, :-1] + 1)[~init[:, 1:]].all()

@@ -34,15 +34,15 @@ def random_rollout(seed=None, **settings):
 @pytest.mark.parametrize(
     "settings", [{}, {"layout": "four_rooms", "num_goals": 3, "view": None, "obstacle": "teleport"}]
 )
-def test_specs(num_envs, settings):
+def test_the_specs_of_the_grid_are_right(num_envs, settings):
     check_env_specs(MultiGoalGridEnv(num_envs, **settings))
 
 
-def test_specs_in_a_serial_env():
+def test_the_specs_of_the_grid_are_right_in_a_serial_env():
     check_env_specs(SerialEnv(2, partial(MultiGoalGridEnv, 2)))
 
 
-def test_specs_in_a_parallel_env():
+def test_the_specs_of_the_grid_are_right_in_a_parallel_env():
     env = ParallelEnv(2, partial(MultiGoalGridEnv, 2, seed=0), mp_start_method="spawn")
     try:
         check_env_specs(env)
@@ -110,7 +110,7 @@ def test_a_partial_reset_touches_only_its_rows():
     assert (after["observation"] == env.rules.observe(env.state)).all()
 
 
-def test_an_episode_starts_anew_after_its_end():
+def test_a_new_episode_starts_after_the_end_of_one():
     rollout = random_rollout(seed=0)
     length = torch.zeros(8)
     for step in rollout["next"].unbind(-1):
@@ -170,7 +170,7 @@ def test_the_state_of_another_number_of_worlds_is_refused():
         MultiGoalGridEnv(3).load_state_dict(MultiGoalGridEnv(4).state_dict())
 
 
-def test_set_world_wants_one_world_for_each_row():
+def test_set_world_needs_one_world_for_each_row():
     with pytest.raises(ValueError, match="agent must have one cell for each of the 4 worlds, got 1"):
         corridor_env(4).set_world(torch.tensor([7]), torch.tensor([[8, 9, 10]]))
 
@@ -196,14 +196,14 @@ def test_every_argument_changes_something(change, shown):
     assert shown(MultiGoalGridEnv(**usual)) != shown(MultiGoalGridEnv(**(usual | change)))
 
 
-def test_device():
+def test_all_tensors_are_on_the_given_device():
     env = MultiGoalGridEnv(2, device="cpu")
     assert env.device == torch.device("cpu")
     assert env.rollout(2).device == torch.device("cpu")
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_cuda():
+def test_the_grid_runs_on_cuda():
     check_env_specs(MultiGoalGridEnv(2, device="cuda", obstacle="teleport"))
 
 
@@ -222,7 +222,7 @@ def test_bad_arguments_are_named(arguments, named):
 
 
 @pytest.mark.slow
-def test_a_core_makes_a_million_steps_a_second():
+def test_one_core_does_a_million_steps_per_second():
     env = MultiGoalGridEnv(1024, seed=0)
     tensordict = env.reset().set("action", torch.randint(4, (1024,)))
     best = float("inf")
@@ -234,7 +234,7 @@ def test_a_core_makes_a_million_steps_a_second():
     assert 1024 / best >= 1_000_000
 
 
-def test_a_state_without_tensors_such_as_torchrl_s_creator_of_environments_makes_restores_nothing():
+def test_a_state_without_tensors_as_from_env_creator_restores_nothing():
     env = EnvCreator(lambda: MultiGoalGridEnv(2, max_steps=6, seed=3))()
     fresh = MultiGoalGridEnv(2, max_steps=6, seed=3)
     assert (env.state.objects == fresh.state.objects).all()

@@ -1,4 +1,4 @@
-"""Rooms and doors: which there are, when they are entered, and where goals are put."""
+"""Rooms and doors: their number, when they are entered, and where goals are placed."""
 
 import random
 
@@ -17,7 +17,7 @@ MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 class Walker:
-    """One agent in nine rooms, followed with loops: the place of a cell is told by its walls, not by a table."""
+    """One agent in nine rooms, followed with loops: the place of a cell is found from its walls, not from a table."""
 
     def __init__(self, row, column):
         self.rows, self.at = LAYOUTS["nine_rooms"], (row, column)
@@ -99,7 +99,7 @@ def test_goals_lie_in_other_rooms_than_the_start_and_nothing_stands_in_a_door():
     assert len(rest) / 4000 == pytest.approx(1 - 19.2 / 169, abs=0.02)  # obstacles stand in the agent's room, too
 
 
-def test_other_layouts_have_places_on_request_only_and_their_worlds_stay():
+def test_other_layouts_have_places_only_on_request_and_the_same_worlds():
     plain, rooms = (MultiGoalGridEnv(4, layout="four_rooms", seed=0, places=places) for places in (None, True))
     assert "rooms_attained" not in plain.observation_spec and len(task_of(plain).subgoals) == 1
     assert task_of(rooms).subgoals[0].names[4:] == ("door 1-2", "door 1-3", "door 2-4", "door 3-4")

@@ -86,7 +86,7 @@ def play(rules, state, actions):
 @pytest.mark.parametrize("view", [3, 5, None])
 @pytest.mark.parametrize("num_goals", [1, 2, 3])
 @pytest.mark.parametrize("layout", ["open", "four_rooms", SMALL, UNWALLED], ids=["open", "rooms", "small", "unwalled"])
-def test_agrees_with_a_plain_reference(layout, num_goals, view, obstacle):
+def test_the_rules_agree_with_a_plain_reference(layout, num_goals, view, obstacle):
     rules = GridRules(layout, num_goals=num_goals, view=view, obstacle=obstacle)
     rows, draw, generator = LAYOUTS.get(layout, layout), random.Random(1), torch.Generator().manual_seed(1)
     for _ in range(3):
@@ -113,7 +113,7 @@ def adopt_moved_obstacle(world, rules, objects):
     world.obstacles[hit] = moved
 
 
-def test_goals_in_order_bring_one_each():
+def test_goals_in_order_pay_one_each():
     rules = GridRules(CORRIDOR, num_goals=3, num_obstacles=0)
     rewards, events, state = play(rules, place(rules, (1, 1), (1, 2), (1, 3), (1, 5)), [RIGHT] * 4)
     assert rewards == [1, 1, 0, 1]
@@ -122,7 +122,7 @@ def test_goals_in_order_bring_one_each():
     assert (state.objects == rules.nowhere).all()
 
 
-def test_every_goal_after_one_out_of_order_brings_a_hundredth():
+def test_every_goal_after_one_out_of_order_pays_a_hundredth():
     rules = GridRules(CORRIDOR, num_goals=3, num_obstacles=0)
     rewards, events, _ = play(rules, place(rules, (1, 1), (1, 3), (1, 2), (1, 4)), [RIGHT] * 3)
     assert rewards == [0.01, 0.01, 0.01]

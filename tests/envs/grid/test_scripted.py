@@ -92,7 +92,7 @@ def check_against(result, expected, slack):
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=str)
-def test_the_random_player(task):
+def test_the_random_player_has_the_measured_results(task):
     expected = dict(zip(TASKS, [(-0.35, 48.8), (-0.37, 49.8), (-0.28, 49.1), (-0.48, 98.6)], strict=True))
     return_mean, steps_mean = expected[task["layout"], task["num_goals"]]
     result = scripted_ceiling("random", obstacle="teleport", episodes=5000, **task)
@@ -115,7 +115,7 @@ def test_the_planner_takes_the_obstacle_where_it_blocks_the_way():
     assert play_world(env, FullInformationPlanner(env), 8, [9, 10, 11]) == [-1, 1, 1]
 
 
-def test_the_planner_gives_up_where_obstacles_cost_more_than_the_goals_bring():
+def test_the_planner_gives_up_where_obstacles_cost_more_than_the_goals_pay():
     env = corridor(6, num_obstacles=3, num_goals=2, max_steps=20)  # cells 9 to 14
     assert play_world(env, FullInformationPlanner(env), 9, [10, 11, 12, 13, 14]) == [0] * 20
 
@@ -132,7 +132,7 @@ def test_the_planner_walks_round_obstacles_and_later_goals():
 
 
 @pytest.mark.parametrize("player", [PerfectMemorySearch, EgocentricSearch])
-def test_players_are_not_moved_by_what_they_have_not_seen(player):
+def test_players_are_not_influenced_by_what_they_have_not_seen(player):
     env = MultiGoalGridEnv(500, num_goals=3, view=5, seed=0)
     start, state = env.reset(), env.state
     seen = (env.rules.window_cells[state.agent][:, :, None] == state.objects[:, None, :]).any(1)
@@ -143,7 +143,7 @@ def test_players_are_not_moved_by_what_they_have_not_seen(player):
     env.state = state
 
 
-def test_the_memory_player_finds_back_to_a_goal_that_it_saw_earlier():
+def test_the_memory_player_returns_to_a_goal_that_it_saw_earlier():
     env = corridor(9, num_obstacles=0, num_goals=2, view=3)  # cells 12 to 20
     rewards = play_world(env, PerfectMemorySearch(env), 14, [20, 13])
     assert len(rewards) == 6 + 7  # to the far end, and all the way back

@@ -36,17 +36,17 @@ def corridor(view=3):
     return MultiGoalGridEnv(1, layout=CORRIDOR, num_obstacles=0, num_goals=1, view=view)
 
 
-def test_it_walks_the_wrong_way_where_it_cannot_know_better():
+def test_the_egocentric_player_walks_the_wrong_way_where_it_cannot_know_better():
     there, back = list(range(13, 11, -1)), list(range(13, 21))
     assert walk(corridor(), 14, [20], 10) == there + back  # no end of the corridor in view: it tries the left first
 
 
-def test_an_end_in_view_tells_where_the_room_is():
+def test_an_end_in_view_shows_the_egocentric_player_where_the_room_is():
     assert walk(corridor(), 19, [12], 7) == list(range(18, 11, -1))
     assert walk(corridor(), 12, [20], 8) == list(range(13, 21))
 
 
-def test_it_knows_the_far_end_once_it_has_seen_the_near_one():
+def test_the_egocentric_player_knows_the_far_end_once_it_has_seen_the_near_one():
     """On cell 19 all has been seen; a player that does not know the corridor's length would look for its end."""
     env = MultiGoalGridEnv(1, layout=CORRIDOR, num_obstacles=1, num_goals=1, view=3)
     assert walk(env, 12, [20, env.rules.nowhere], 9)[6] == 19
@@ -81,7 +81,7 @@ def test_the_true_start_always_fits():
 
 
 @pytest.mark.parametrize("view", [1, 3, 5])
-def test_it_does_not_use_its_position(view):
+def test_the_egocentric_player_does_not_use_its_position(view):
     """The player sees the cells of the world renamed at random: only whether a step moved it comes through."""
     settings = {"num_goals": 3, "view": view, "layout": "four_rooms", "seed": 0}
     env, other = MultiGoalGridEnv(40, **settings), MultiGoalGridEnv(40, **settings)
@@ -96,7 +96,7 @@ def test_it_does_not_use_its_position(view):
     assert (paths(env, blinded) == paths(other, EgocentricSearch(other))).all()
 
 
-def test_where_the_windows_are_the_same_it_does_the_same():
+def test_the_egocentric_player_acts_alike_where_the_windows_are_alike():
     env = MultiGoalGridEnv(2, num_obstacles=1, num_goals=1, view=3)
     offset = 3 * 11 + 2
     start = torch.tensor([3 * 11 + 4, 3 * 11 + 4 + offset])
@@ -111,12 +111,12 @@ def test_where_the_windows_are_the_same_it_does_the_same():
 
 
 @pytest.mark.parametrize("task", [{"view": None, "num_goals": 3}, {"view": None, "layout": "four_rooms"}], ids=str)
-def test_with_the_whole_map_in_view_it_is_the_memory_player(task):
+def test_with_the_whole_map_in_view_the_egocentric_player_equals_the_memory_player(task):
     env, other = (MultiGoalGridEnv(50, seed=1, **task) for _ in range(2))
     assert (paths(env, EgocentricSearch(env)) == paths(other, PerfectMemorySearch(other))).all()
 
 
-def test_where_the_first_window_tells_the_place_it_is_the_memory_player(monkeypatch):
+def test_where_the_first_window_shows_the_position_the_egocentric_player_equals_the_memory_player(monkeypatch):
     monkeypatch.setattr(searching, "_HASTE_IN_DOUBT", searching._HASTE)
     env, other = (MultiGoalGridEnv(50, seed=1, layout="four_rooms", view=5) for _ in range(2))
     assert (paths(env, EgocentricSearch(env)) == paths(other, PerfectMemorySearch(other))).all()
@@ -133,7 +133,7 @@ def test_a_stopped_step_shows_a_wall_to_a_player_that_sees_only_its_own_cell():
     assert player._place.item() == player._start
 
 
-def test_it_finds_almost_all_goals_somewhat_later_than_the_memory_player():
+def test_the_egocentric_player_finds_almost_all_goals_somewhat_later_than_the_memory_player():
     env, other = (MultiGoalGridEnv(300, seed=1) for _ in range(2))
     lost, told = play_episodes(env, EgocentricSearch(env)), play_episodes(other, PerfectMemorySearch(other))
     assert lost["success_rate"] >= 0.99

@@ -36,7 +36,7 @@ def route():
 
 
 class TestRoute:
-    def test_key_and_door(self, route):
+    def test_the_route_takes_the_key_and_opens_a_door(self, route):
         _, steps = route
         scores = {int(step): float(steps["reward"][step]) for step in steps["reward"].squeeze(-1).nonzero()}
         assert scores == {75: 100.0, 166: 300.0}
@@ -81,7 +81,7 @@ class TestRoute:
         came = steps["attained"][:, door].nonzero().flatten().tolist()
         assert len(came) == 1 and not steps["available"][came[0], door]
 
-    def test_position(self, route):
+    def test_the_position_starts_in_the_middle_and_stays_in_the_room(self, route):
         _, steps = route
         assert steps["position"][0].tolist() == [83.5, 82.5]
         x, y = steps["position"].T
@@ -111,7 +111,7 @@ def test_the_screen_shows_the_agent_where_the_ram_says():
 
 
 @pytest.mark.parametrize("settings", [{}, {"key_and_door": True, "noops": 30, "practice": 0.5}], ids=str)
-def test_it_keeps_the_contract_of_tasks_and_has_no_scripted_players(settings):
+def test_montezuma_fulfils_the_contract_for_tasks_without_scripted_players(settings):
     found = check_task(make_montezuma(2, max_steps=40, **settings), steps=60)
     assert [finding.costs for finding in found] == ["no ceiling line"]
 
@@ -127,7 +127,7 @@ def fall(**settings):
 
 
 class TestDeath:
-    def test_it_is_noticed_at_once_and_ends_the_episode(self):
+    def test_a_death_is_noticed_at_once_and_ends_the_episode(self):
         _, steps = fall()
         (died,) = steps["hazard"].squeeze(-1).nonzero().flatten().tolist()[:1]
         assert steps["terminated"][died] and not steps["terminated"][:died].any()
@@ -156,13 +156,13 @@ class TestDeath:
 
 
 class TestEpisodes:
-    def test_step_limit(self):
+    def test_the_step_limit_truncates(self):
         env = MontezumaEnv(1, seed=0, max_steps=3)
         steps = play(env, [0] * 3)
         assert steps["truncated"].flatten().tolist() == [False, False, True]
         assert not steps["terminated"].any()
 
-    def test_partial_resets(self):
+    def test_a_partial_reset_leaves_other_emulators_alone(self):
         env = MontezumaEnv(3, seed=0)
         tensordict = env.reset()
         for _ in range(5):
@@ -190,7 +190,7 @@ class TestEpisodes:
         assert (first == positions(1)).all()
         assert (first != second).any()
 
-    def test_no_emulator_draws_what_another_one_drew_under_the_seed_before(self):
+    def test_neighbouring_seeds_share_no_random_numbers(self):
         """Evaluations that choose a checkpoint have one seed, those that report it the next."""
         env = MontezumaEnv(3, sticky=0.25)
 
@@ -204,7 +204,7 @@ class TestEpisodes:
 
         assert not any((one == other).all() for one in paths(1) for other in paths(2))
 
-    def test_a_seed_starts_over_whatever_came_before(self):
+    def test_seeding_starts_everything_over(self):
         env = MontezumaEnv(2, seed=3, noops=30, practice=1.0, practice_steps=100)
         first = env.reset()["pixels"]
         play(env, ROUTE["actions"][:7])
@@ -222,13 +222,13 @@ class TestEpisodes:
         assert not again["available"][0, SUBGOALS.index("middle_ladder_bottom")]
         assert again["attained"][0].nonzero().tolist() == [[SUBGOALS.index("middle_ladder_bottom")]]
 
-    def test_practice_ends(self):
+    def test_practice_ends_after_practice_steps(self):
         env = MontezumaEnv(1, seed=0, practice=1.0, practice_steps=7)
         play(env, ROUTE["actions"][:7])
         assert env.reset()["position"].tolist() == [[79.5, 82.5]]
 
 
-def test_a_saved_state_goes_on_as_it_would_have():
+def test_a_restored_environment_goes_on_as_the_original():
     settings = {"sticky": 0.25, "practice": 0.5, "noops": 5, "max_steps": 30}
     env, other = MontezumaEnv(3, seed=1, **settings), MontezumaEnv(3, seed=9, **settings)
     torch.manual_seed(0)
@@ -257,7 +257,7 @@ def test_a_state_of_another_size_is_refused():
         MontezumaEnv(2, seed=0).load_state_dict(MontezumaEnv(1, seed=0).state_dict())
 
 
-def test_threads_change_nothing():
+def test_threads_do_not_change_the_results():
     one, two = (MontezumaEnv(5, seed=0, threads=threads) for threads in (1, 2))
     torch.manual_seed(0)
     actions = torch.randint(18, (20, 5))
@@ -270,11 +270,11 @@ def test_threads_change_nothing():
 
 @pytest.mark.parametrize("settings", [{}, {"view": None}, {"keep_pixels": True}, {"actions": USEFUL_ACTIONS}], ids=str)
 @pytest.mark.parametrize("num_envs", [1, 3])
-def test_specs(num_envs, settings):
+def test_the_specs_of_montezuma_are_right(num_envs, settings):
     check_env_specs(make_montezuma(num_envs, seed=0, **settings))
 
 
-def test_the_actions_are_those_asked_for():
+def test_the_actions_can_be_chosen():
     env = MontezumaEnv(1, actions=USEFUL_ACTIONS, seed=0)
     useful = [USEFUL_ACTIONS.index(action) for action in ROUTE["actions"][:40]]
     assert (play(env, useful)["position"] == play(MontezumaEnv(1, seed=0), ROUTE["actions"][:40])["position"]).all()
@@ -305,12 +305,12 @@ def test_what_the_agent_sees_is_black_beyond_the_screen():
         ({"threads": 0}, "threads must be >= 1, got 0"),
     ],
 )
-def test_wrong_settings(settings, message):
+def test_wrong_settings_of_montezuma_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         MontezumaEnv(**settings)
 
 
-def test_all_actions():
+def test_all_18_actions_are_the_default():
     assert MontezumaEnv(1, seed=0).action_spec.n == len(ALL_ACTIONS) == 18
 
 
