@@ -53,7 +53,7 @@ def changed(**changes):
 
 
 def tagged(tag):
-    """The text of a valid config.yaml with ``tag`` in place of the environment."""
+    """The text of a valid config.yaml with ``tag`` instead of the environment."""
     return changed(env="HERE").replace("env: HERE", f"env: {tag}")
 
 

@@ -29,7 +29,7 @@ SHORTER = {
     "num_envs=250": "num_envs=4",
     "episodes=250": "episodes=4",
 }
-"""What is replaced in Python blocks, so that they take seconds; test_learning.py runs the README's as it stands."""
+"""Replacements in Python blocks, so that they take seconds; test_learning.py runs the README's unchanged."""
 
 RUN = "outputs/gridworld-v2/2026-11-22_16-04-11-seed0"
 """The run folder that the pages name."""

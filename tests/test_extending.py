@@ -6,7 +6,7 @@ import torch
 PAGE = Path(__file__).parents[1] / "docs/extending.md"
 
 
-def test_what_the_page_shows_works_as_it_stands():
+def test_the_code_of_the_page_on_extending_works():
     torch.manual_seed(0)
     names: dict = {}
     for number, code in enumerate(re.findall(r"```python\n(.*?)```", PAGE.read_text(), flags=re.S)):

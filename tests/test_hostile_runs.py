@@ -402,7 +402,7 @@ def test_an_archive_holds_only_files_of_runs(run, monkeypatch, members):
         findings.read_runs([str(path)], stack)
 
 
-def test_a_file_that_is_no_archive_is_refused(run):
+def test_a_file_that_is_not_an_archive_is_refused(run):
     (run.parent / "runs.tar.xz").write_bytes(b"text")
     with ExitStack() as stack, pytest.raises(SettingsError, match="readable archives"):
         findings.read_runs([str(run.parent / "runs.tar.xz")], stack)

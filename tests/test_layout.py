@@ -60,7 +60,7 @@ def texts_of(path):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_one_module_knows_the_names_of_what_a_run_folder_holds(path):
+def test_only_one_module_spells_the_file_names_of_a_run_folder(path):
     names = {*layout.WRITTEN, layout.CHECKPOINTS, layout.EVALUATIONS}
     if path == Path(layout.__file__) or path.name == "configuration.py":  # conf/ has a config.yaml, too
         return

@@ -99,14 +99,14 @@ def test_agents_learn_to_reach_two_goals_in_order(make, frames, threshold):
 
 @pytest.mark.slow
 def test_the_readme_s_training_learns(capsys):
-    """As it stands; a random agent's return is about 0.1."""
+    """Unchanged; a random agent's return is about 0.1."""
     exec(python_blocks(README)[0], {"__name__": "readme"})
     assert float(capsys.readouterr().out.split()[-1]) > 0.6
 
 
 @pytest.mark.slow
-def test_drqn_learns_what_takes_memory():
-    """The window shows a part of the room: who forgets what was behind finds the second goal by luck."""
+def test_drqn_learns_a_task_that_needs_memory():
+    """The window shows a part of the room: an agent that forgets what was behind it finds the second goal by luck."""
     (with_memory, before), (without, _) = (learned(name, 45_000, exploration=schedule()) for name in ("drqn", "dqn"))
     assert before < 0.5 and with_memory >= 0.8 > 0.7 >= without
 
@@ -122,7 +122,7 @@ def test_drqn_learns_what_takes_memory():
     ids=["exact states", "bf16", "R2D2"],
 )
 def test_v3_solves_a_small_room(sequences):
-    """In two thirds of v2's frames; with view 3 it has to remember what it passed."""
+    """In two thirds of v2's frames; with view 3 it has to remember what it has passed."""
     torch.manual_seed(0)
     env = small_env(32, **TASK)
     usual = {"capacity": 50_000, "warmup_frames": 2_000, "learning_rate": 3e-3, "tau": 0.02, "max_grad_norm": 10.0}

@@ -1,4 +1,4 @@
-"""Values learned by hindsight in worlds so small that the right ones are known."""
+"""Values learned by hindsight in worlds so small that the true ones are known."""
 
 import itertools
 
@@ -60,7 +60,7 @@ def largest_errors(sub):
     [(make_hdqn, {}), (make_hdrqn, {"slice_len": 4, "trace_decay": 0.8, "batch_size": 32})],
     ids=["hdqn", "v2-lambda"],
 )
-def test_the_values_of_a_subgoal_that_was_never_pursued(builder, settings):
+def test_hindsight_learns_the_values_of_a_subgoal_that_was_never_pursued(builder, settings):
     """From random play in which every option was sent to goal 0."""
     errors, goal_0 = {}, torch.zeros(64, dtype=torch.int64)
     for hindsight in (True, False):
@@ -73,7 +73,7 @@ def test_the_values_of_a_subgoal_that_was_never_pursued(builder, settings):
 
 
 @pytest.mark.parametrize("hindsight", [True, False])
-def test_the_value_of_a_choice_that_was_never_made(hindsight):
+def test_hindsight_learns_the_value_of_a_choice_that_was_never_made(hindsight):
     """Every option was sent to goal 1 and walked over goal 0 first: 1 now, and 1 a step later."""
     env = small_env(1, **CORRIDOR)
     algorithm = make(make_hdqn, env, meta={"slice_len": 1}, meta_hindsight=hindsight)

@@ -16,7 +16,7 @@ from hdrqn_torchrl.modules import compact_network
 TARGET = "examples.own_algorithm.soft_v2.make_soft_v2"
 
 
-def test_it_trains_from_the_command_line(tmp_path):
+def test_a_users_algorithm_trains_from_the_command_line(tmp_path):
     command = ["train.py", "--config-dir", "examples/own_algorithm", "algo=soft_v2", "logger=csv", *TINY, *TINY_HDRQN]
     done = call(ROOT, *command, f"allowed_targets=[{TARGET}]", "algo.temperature=0.25", f"hydra.run.dir={tmp_path}/run")
     assert done.returncode == 0, done.stderr
@@ -25,7 +25,7 @@ def test_it_trains_from_the_command_line(tmp_path):
     assert "temperature: 0.25" in (tmp_path / "run/config.yaml").read_text()
 
 
-def test_random_choices_prefer_what_is_worth_more():
+def test_random_choices_prefer_higher_values():
     torch.manual_seed(0)
     values = torch.tensor([0.0, 1.0, -torch.inf]).expand(4_000, 3)
     chosen = SoftEpsilonGreedy(0.5, anneal_frames=1).random_choice(values, values.isfinite())
@@ -34,7 +34,7 @@ def test_random_choices_prefer_what_is_worth_more():
     assert (counts[1] / counts[0]).item() == pytest.approx(torch.tensor(1.0 / 0.5).exp().item(), rel=0.15)
 
 
-def test_both_levels_explore_so():
+def test_both_levels_of_the_users_algorithm_explore_softly():
     agent = make_soft_v2(small_env(2), compact_network(8, (8,)), temperature=0.25)
     assert [(each.temperature, each.anneal_frames) for each in agent.explorations.values()] == [
         (0.25, 100_000),

@@ -36,7 +36,7 @@ LEARNERS = {"v3": ["learner"], "dqn": ["learner"], "drqn": ["learner"]}
 
 @cache
 def composed(env, algo, network):
-    """A small training, with Hydra's part."""
+    """The settings of a small training, with Hydra's own."""
     quick = [*QUICK, f"env={env}", f"algo={algo}", f"network={network}"]
     for level in LEARNERS.get(algo, ["sub", "meta"]):
         quick += [f"algo.{level}.{each}" for each in ("batch_size=4", "warmup_frames=8", "frames_per_update=16")]

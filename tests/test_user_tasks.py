@@ -1,4 +1,4 @@
-"""The scripts on a task of someone else's: no end, no success, no hazard, no order, no picture."""
+"""The programs on a user's task: no end, no success, no hazard, no order, no picture."""
 
 import csv
 import json
@@ -46,7 +46,7 @@ def call(script, monkeypatch, *arguments):
     command_line(script.Settings, script.__doc__, script.run)
 
 
-def test_both_levels_learn_and_evaluations_end(run):
+def test_both_levels_learn_on_a_users_task_and_evaluations_end(run):
     with (run / "metrics.csv").open(newline="") as file:
         last = list(csv.DictReader(file))[-1]
     assert int(last["sub/updates"]) > 0 and int(last["meta/updates"]) > 0
@@ -56,7 +56,7 @@ def test_both_levels_learn_and_evaluations_end(run):
     assert not {"in_order_rate", "success_rate"} & set(summary) and summary["ceiling"] is None
 
 
-def test_it_is_evaluated_and_plotted_with_what_there_is(run, tmp_path, monkeypatch, capsys):
+def test_a_users_task_is_evaluated_and_plotted_without_optional_entries(run, tmp_path, monkeypatch, capsys):
     call(evaluate, monkeypatch, f"run={run}", "episodes=4", TRUSTED, f"figures={tmp_path}")
     result = json.loads(capsys.readouterr().out)
     assert result["cut_off_rate"] == 1.0 and "in_order_rate" not in result
@@ -66,14 +66,14 @@ def test_it_is_evaluated_and_plotted_with_what_there_is(run, tmp_path, monkeypat
         assert (tmp_path / f"{kind}.png").stat().st_size > 1000
 
 
-def test_it_is_watched_in_numbers_and_episodes_without_end_are_cut_off(run, tmp_path, monkeypatch, capsys):
+def test_a_users_task_is_watched_in_numbers_and_endless_episodes_are_cut_off(run, tmp_path, monkeypatch, capsys):
     call(watch, monkeypatch, f"run={run}", f"out={tmp_path}/episode.gif", "episodes=1", TRUSTED)
     told = capsys.readouterr().out
     assert "episode 1: time is up" in told and "20 steps" in told and (tmp_path / "episode.gif").stat().st_size > 1000
 
 
 @pytest.mark.parametrize("algorithm", ["v1", "v2", "v3"])
-def test_subgoals_that_can_be_attained_again_stay_and_what_is_rendered_is_watched(algorithm, tmp_path):
+def test_repeatable_subgoals_stay_available_and_rendered_pictures_are_watched(algorithm, tmp_path):
     env = Pictured(1)
     network = compact_network(8, (8,))
     agent = make_v3(env, network) if algorithm == "v3" else make_hdrqn(env, network, version=algorithm)
@@ -84,7 +84,7 @@ def test_subgoals_that_can_be_attained_again_stay_and_what_is_rendered_is_watche
     assert isinstance(frames[0].scene.rendered, np.ndarray) and draw_frame(frames[0]).shape[1] > 100
 
 
-def test_what_an_agent_needs_is_said_before_anything_is_trained(tmp_path):
+def test_missing_entries_are_reported_before_anything_is_trained(tmp_path):
     ended = train(tmp_path, "algo=v3", "+env.without=[attained,success]")
     assert ended.returncode == 1 and "Traceback" not in ended.stderr
     assert "error: algo.env must have what make_v3 reads:" in ended.stderr
