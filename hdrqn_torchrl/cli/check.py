@@ -10,16 +10,19 @@ code is 1 if something is wrong that prevents training, else 0. docs/own_tasks.m
 
 from __future__ import annotations
 
+import argparse
 import sys
+from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import open_dict
 
+from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, resolved
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build_env
-from hdrqn_torchrl.runs.commands import as_called
+from hdrqn_torchrl.runs.commands import as_called, command_of
 from hdrqn_torchrl.runs.settings import RunSettings, check
 
 WORLDS = 4
@@ -45,10 +48,15 @@ def composed(arguments: list[str]) -> RunSettings:
     Raises:
         SettingsError: if they can't be composed, or break a rule.
     """
-    overrides = [*arguments]
-    while "--config-dir" in overrides:
-        place = overrides.index("--config-dir")
-        overrides[place : place + 2] = [f"hydra.searchpath=[file://{''.join(overrides[place + 1 : place + 2])}]"]
+    options = argparse.ArgumentParser(prog=command_of("check"), allow_abbrev=False)
+    options.add_argument("--config-dir", "-cd", type=Path)
+    options.add_argument("overrides", nargs="*")
+    given = options.parse_args(overrides_last(arguments))
+    overrides = list(given.overrides)
+    if given.config_dir is not None:
+        if not given.config_dir.is_dir():
+            raise SettingsError(f"--config-dir must be a folder, got {str(given.config_dir)!r}, which is none.")
+        overrides.append(f"hydra.searchpath=['file://{given.config_dir.absolute()}']")
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose("config", overrides=overrides, return_hydra_config=True)

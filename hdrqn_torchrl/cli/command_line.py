@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -32,6 +32,17 @@ def check_place(path: Path, key: str) -> None:
             raise IsADirectoryError("it is a folder")
     except OSError as error:
         raise SettingsError(f"{key} must be a file that can be written, got {str(path)!r} ({error}).") from error
+
+
+def overrides_last(arguments: Sequence[str]) -> list[str]:
+    """Hydra's arguments with its options before the settings, in which order alone it reads them.
+
+    Examples:
+        >>> overrides_last(["env=mine", "--config-dir", "my_conf", "~algo.gamma", "-m", "seed=0,1"])
+        ['--config-dir', 'my_conf', '-m', 'env=mine', '~algo.gamma', 'seed=0,1']
+    """
+    settings = [each for each in arguments if not each.startswith("-") and ("=" in each or each.startswith("~"))]
+    return [each for each in arguments if each not in settings] + settings
 
 
 def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:

@@ -18,6 +18,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hdrqn_torchrl.cli import sweeps
+from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
 from hdrqn_torchrl.runs import layout
@@ -33,8 +34,14 @@ if TYPE_CHECKING:
     from hdrqn_torchrl.runs.trainer import Trainer
 
 
+def main() -> None:
+    """Runs with the arguments of the command line."""
+    sys.argv[1:] = overrides_last(sys.argv[1:])
+    composed()
+
+
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
-def main(config: DictConfig) -> float:
+def composed(config: DictConfig) -> float:
     """Builds and trains; returns the final greedy return, so that a sweeper can maximise it.
 
     Exit codes: 0 done; 1 failed, and a message says why; 130 and 143 stopped by SIGINT or SIGTERM: resume me.

@@ -25,7 +25,7 @@ class SettingsError(ValueError):
 
 
 def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
-    """Checks the types of all settings below ``path``.
+    """Checks the names and types of all settings below ``path``.
 
     Args:
         node: settings with a ``_target_``, plain data; those below it may have targets, too.
@@ -33,7 +33,8 @@ def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
         locate: finds what a ``_target_`` names.
 
     Raises:
-        SettingsError: with the full name of the first setting of another type than its builder's annotations ask for.
+        SettingsError: with the full name of the first setting that its builder does not take, or of another type than
+            its annotations ask for.
 
     Examples:
         >>> from hdrqn_torchrl.modules import EpsilonGreedy
@@ -45,9 +46,18 @@ def check_arguments(node: Any, path: str, locate: Callable[[str], Any]) -> None:
     """
     if not isinstance(node, Mapping) or not isinstance(node.get(TARGET), str):
         raise SettingsError(f"{path} must be settings with a {TARGET}, got {shown(node)}; {remedy()}.")
-    hints = annotations_of(locate(node[TARGET]))
+    try:
+        builder = locate(node[TARGET])
+    except SettingsError as error:
+        raise SettingsError(f"{path}.{error}") from error
+    hints, taken = annotations_of(builder), _taken_by(builder)
     for name, value in _settings(node):
         full = f"{path}.{name}"
+        if taken is not None and name not in taken:
+            raise SettingsError(
+                f"{full} must be left out, got {shown(value)}: {node[TARGET]} takes {', '.join(taken)}; "
+                f"'~{full}' in the command of a training leaves it out."
+            )
         if isinstance(value, Mapping) and TARGET in value:
             check_arguments(value, full, locate)
         elif name in hints and not fits(value, hints[name]):
@@ -70,6 +80,18 @@ def annotations_of(builder: Callable) -> dict[str, Any]:
         return get_type_hints(builder.__init__ if inspect.isclass(builder) else builder)
     except NameError:  # of someone else's builder, with names that only type checkers import
         return {}
+
+
+def _taken_by(builder: Callable) -> list[str] | None:
+    """Names of the arguments of a function or class; ``None`` if it takes any, or can't be asked."""
+    is_class = inspect.isclass(builder)  # whose own signature a metaclass, such as TorchRL's, may hide
+    try:
+        parameters = list(inspect.signature(builder.__init__ if is_class else builder).parameters.values())[is_class:]
+    except (ValueError, TypeError):
+        return None
+    anything = any(each.kind is inspect.Parameter.VAR_KEYWORD for each in parameters)
+    positional = inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.VAR_POSITIONAL
+    return None if anything else [each.name for each in parameters if each.kind not in positional]
 
 
 def fits(value: Any, hint: Any) -> bool:

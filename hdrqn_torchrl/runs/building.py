@@ -81,7 +81,10 @@ def locate(target: str) -> Callable[..., Any]:
     try:
         found = pkgutil.resolve_name(target)
     except (ImportError, AttributeError, ValueError) as error:
-        raise SettingsError(f"_target_ must name a function or class, got {target!r} ({error}).") from error
+        raise SettingsError(
+            f"_target_ must name a function or class, got {target!r} ({error}); install its package, or name the "
+            "folder that holds it: PYTHONPATH=FOLDER before the command."
+        ) from error
     if not callable(found):
         raise SettingsError(f"_target_ must name a function or class, got {target!r}, which is neither.")
     return found

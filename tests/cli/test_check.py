@@ -24,10 +24,11 @@ def test_a_task_of_the_package_has_no_fault_and_no_folder_is_made(run, tmp_path)
     assert not list(tmp_path.iterdir())
 
 
-def test_an_environment_of_a_users_configuration_folder_is_checked(run, tmp_path):
-    (tmp_path / "env").mkdir()
-    (tmp_path / "env" / "small.yaml").write_text("defaults:\n  - gridworld\n  - _self_\nmax_steps: 5\n")
-    assert run("env=small", "--config-dir", str(tmp_path)) == (0, "nothing is wrong or missing\n")
+@pytest.mark.parametrize("option", [["--config-dir", "my conf"], ["--config-dir=my conf"], ["-cd", "my conf"]])
+def test_an_environment_of_a_users_configuration_folder_is_checked_wherever_the_folder_is_named(run, tmp_path, option):
+    (tmp_path / "my conf" / "env").mkdir(parents=True)
+    (tmp_path / "my conf" / "env" / "small.yaml").write_text("defaults:\n  - gridworld\n  - _self_\nmax_steps: 5\n")
+    assert run("env=small", *option, "env.max_steps=6") == (0, "nothing is wrong or missing\n")
 
 
 def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
@@ -42,6 +43,8 @@ def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
         ("env._target_=mine.Env", "error: env._target_ must be one of the builders that this program trusts there"),
         ("env=nothing", "error: In 'config': Could not find 'env/nothing'"),
         ("env.veiw=4", "error: Could not override 'env.veiw'."),
+        ("+env.veiw=4", "error: env.veiw must be left out, got 4: hdrqn_torchrl.envs.MultiGoalGridEnv takes num_envs,"),
+        ("--config-dir=nowhere", "error: --config-dir must be a folder, got 'nowhere'"),
     ],
 )
 def test_a_wrong_argument_is_reported(run, argument, told):

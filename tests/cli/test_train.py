@@ -139,15 +139,21 @@ class TestMessages:
         for part in parts:
             assert part in message, message
 
+    def test_options_of_hydra_may_stand_between_settings(self, run, tmp_path):
+        (tmp_path / "my_conf" / "env").mkdir(parents=True)
+        (tmp_path / "my_conf" / "env" / "mine.yaml").write_text("defaults:\n  - gridworld\n  - _self_\nview: 4\n")
+        told = run("env=mine", "--config-dir", str(tmp_path / "my_conf"), "env.max_steps=6")
+        assert "env.view must be an odd number" in told
+
     @pytest.mark.parametrize(
         ("argument", "part"),
         [
             ("algo=v9", "algo/v9"),
             ("env=maze", "env/maze"),
             ("env.veiw=3", "env.veiw"),
-            ("+env.veiw=3", "'veiw'"),
+            ("+env.veiw=3", "env.veiw must be left out, got 3"),
             ("algo.sub.slice_length=3", "algo.sub.slice_length"),
-            ("+algo.sub.slice_length=3", "'slice_length'"),
+            ("+algo.sub.slice_length=3", "algo.sub.slice_length must be left out, got 3"),
             ("total_frams=5", "total_frams"),
             ("+total_frams=5", "total_frams"),
             ("+evaluation.episods=5", "episods"),

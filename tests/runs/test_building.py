@@ -70,9 +70,15 @@ class TestMessages:
         with pytest.raises(SettingsError, match=r"^algo\.sub\.batch_size must be >= 1, got 0; "):
             build(settings, small_env(2), compact_network(), place="algo")
 
-    def test_an_unknown_setting_is_reported_with_the_command_that_lists_the_known_ones(self):
-        with pytest.raises(SettingsError, match=r"^env: .*'veiw'; `python train\.py --cfg job` "):
+    def test_an_unknown_setting_is_reported_with_those_that_its_builder_takes(self):
+        told = r"^env\.veiw must be left out, got 4: .*MultiGoalGridEnv takes num_envs, .*view.*; '~env\.veiw' in"
+        with pytest.raises(SettingsError, match=told):
             build(GRID | {"veiw": 4}, place="env")
+
+    def test_a_setting_of_the_builder_that_another_one_replaced_is_refused(self):
+        explores = {"_target_": "hdrqn_torchrl.modules.EpsilonGreedy", "start": 1.0, "exponent": 2.0}
+        with pytest.raises(SettingsError, match=r"^algo\.sub_exploration\.exponent must be left out, got 2\.0: "):
+            build(V2 | {"sub_exploration": explores}, None, None, place="algo")
 
     def test_an_error_of_the_machine_is_not_blamed_on_a_setting(self, tmp_path):
         (tmp_path / "file").write_text("")
@@ -82,8 +88,12 @@ class TestMessages:
 
     @pytest.mark.parametrize("target", ["no_such_package.Env", "hdrqn_torchrl.envs.NoSuchEnv", "hdrqn_torchrl.envs"])
     def test_a_target_that_can_not_be_called_is_refused(self, target):
-        with pytest.raises(SettingsError, match=rf"^_target_ must name a function or class, got '{target}'"):
+        with pytest.raises(SettingsError, match=rf"^env\._target_ must name a function or class, got '{target}'"):
             build({"_target_": target}, place="env", allowed=[target])
+
+    def test_a_missing_module_is_reported_with_how_to_name_its_folder(self):
+        with pytest.raises(SettingsError, match=r"; install its package, or name the folder .* PYTHONPATH=FOLDER"):
+            build({"_target_": "no_such_package.Env"}, place="env", allowed=["no_such_package.Env"])
 
 
 def test_settings_that_a_logger_only_shows_are_not_built():
