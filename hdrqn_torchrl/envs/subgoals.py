@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from hdrqn_torchrl import keys
 
 TAKEN_PREFIXES = ("sub", "meta", "joint", "flat", "active", "hindsight", "memory", "behaviour", "greedy")
-"""Names of levels, learners and columns, and beginnings of other entries' names."""
+"""Names of levels, learners and columns, and prefixes of other entries' names."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,7 +19,7 @@ class SubgoalSet:
     ``available`` ``[N, G]``, under the names of :class:`~hdrqn_torchrl.keys.OptionKeys`.
 
     Args:
-        names: of its subgoals, at least one and no two alike.
+        names: of its subgoals, at least one, all distinct.
         prefix: of its entries, also the name of the level that chooses among them; empty for the farthest set.
         repeatable: whether a subgoal can be attained more than once in an episode.
 
@@ -56,18 +56,16 @@ def check_names(argument: str, names: Sequence[str]) -> tuple[str, ...]:
     """Names that are shown to people, as a tuple.
 
     Raises:
-        ValueError: if they are no list of texts, or one is empty or there twice.
+        ValueError: if they are not a list of distinct, non-empty strings.
     """
     listed = tuple(names) if isinstance(names, Sequence) and not isinstance(names, str) else None
     if listed is None or not all(isinstance(name, str) and name for name in listed) or len(set(listed)) < len(listed):
-        raise ValueError(
-            f'{argument} must be different texts, none of them empty, got {names!r}; use ("north", "south").'
-        )
+        raise ValueError(f'{argument} must be distinct, non-empty strings, got {names!r}; use ("north", "south").')
     return listed
 
 
 def check_flag(argument: str, value: bool) -> None:
-    """Refuses what is neither ``True`` nor ``False``.
+    """Refuses anything but ``True`` and ``False``.
 
     Raises:
         ValueError: if it is something else.
@@ -80,7 +78,7 @@ def check_sets(sets: Sequence[SubgoalSet]) -> tuple[SubgoalSet, ...]:
     """The sets of a task, as a tuple.
 
     Raises:
-        ValueError: if they are not sets from near to far with entries of their own.
+        ValueError: if they are not sets from near to far with distinct entries.
     """
     if not isinstance(sets, Sequence) or not all(isinstance(each, SubgoalSet) for each in sets):
         raise ValueError(f"subgoals must be a tuple of SubgoalSet, got {sets!r}; use (SubgoalSet(names=...),).")

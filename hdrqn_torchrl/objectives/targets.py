@@ -223,7 +223,7 @@ def training_mask(valid: Tensor, init: Tensor, burn_in: float, train_exact_state
         burn_in: share of each sequence, rounded down to steps, that is left out at its beginning.
         train_exact_states: whether leading steps whose state is exact are trained nevertheless. Without it a short
             trajectory's first steps are never trained.
-        lookahead: steps at the end that the targets of others need and that are no part of the sequence.
+        lookahead: steps at the end that the targets of others need and that are not part of the sequence.
 
     Returns:
         bool mask.

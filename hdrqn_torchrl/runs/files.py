@@ -203,7 +203,7 @@ def remove(path: Path, *, root: Path | None = None) -> None:
     """Removes a file, if it is there.
 
     Raises:
-        RunFileError: if it is no regular file.
+        RunFileError: if it is not a regular file.
     """
     check_file(path, root=root)
     path.unlink(missing_ok=True)

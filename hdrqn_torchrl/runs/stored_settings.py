@@ -31,7 +31,7 @@ _EARLIER: dict[str, tuple[str, Any]] = {
     "${oc.select:env.num_goals,null}": ("env.num_goals", None),
     "${oc.select:env.max_steps,50}": ("env.max_steps", 50),
 }
-"""What conf/ has left in ``config.yaml``: exact texts, the setting meant, and its value if that is not there."""
+"""What conf/ has left in ``config.yaml``: exact strings, the setting meant, and its value if that is not there."""
 _MOVED = {
     "hdrqn_torchrl.learner.LearnerSettings": "hdrqn_torchrl.learning.LearnerSettings",
     "hdrqn_torchrl.phases.PhaseOne": "hdrqn_torchrl.learning.PhaseOne",

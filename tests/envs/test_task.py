@@ -92,7 +92,7 @@ class TestWhatIsFound:
         ({"smallest_extrinsic_return": "0"}, "smallest_extrinsic_return must be a number, got '0'"),
         ({"ordered": "yes"}, "ordered must be True or False, got 'yes'"),
         ({"success": 3}, "success must be the name of an entry, got 3"),
-        ({"actions": "up"}, "actions must be different texts, none of them empty, got 'up'"),
+        ({"actions": "up"}, "actions must be distinct, non-empty strings, got 'up'"),
         ({"scene": "picture"}, "scene must be a function or None, got 'picture'"),
         ({"references": {"hero": 2.0}}, "references must be {.*}, got {'hero': 2.0}"),
         ({"ceiling": "hero"}, r"ceiling must be one of the references \[\], got 'hero'"),

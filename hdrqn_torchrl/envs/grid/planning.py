@@ -65,7 +65,7 @@ def _cost_to_go(start: Tensor, entry: Tensor) -> Tensor:
     corridor at a time, so that there are about as many rounds as a path has turns.
 
     Args:
-        start: cost of ending on a cell, infinite where it is no target, ``[height, width, N]``.
+        start: cost of ending on a cell, infinite where it is not a target, ``[height, width, N]``.
         entry: cost of entering a cell, infinite for walls, of the same shape.
 
     Returns:
