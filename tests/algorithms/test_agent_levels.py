@@ -101,7 +101,7 @@ class TestThreeLevels:
 
     def test_each_level_chooses_by_its_values_for_the_subgoal_above(self, played):
         values = [torch.stack(level, 1) for level in zip(*(values for values, _ in self.acted_by), strict=True)]
-        assert [value.shape[2:] for value in values] == [(3, 4), (2, 3), (1, 2)]
+        assert [value.shape[2:] for value in values] == [(5, 4), (2, 5), (1, 2)]
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             greedy = self.algorithm.policy(played.select(*self.algorithm.policy.in_keys)[:, 0].clone())
         assert played["rooms_option_init"][:, 0].all()

@@ -34,8 +34,9 @@ class MultiGoalGridEnv(EnvBase):
     **Reward.** ``reward``: -1 on an obstacle, +1 for each goal in order, 0.01 for a goal out of order.
     ``extrinsic_reward``: the same without the obstacle's penalty. Besides these: ``attained`` ``[K]`` (goals
     reached by this step), ``hazard`` (obstacle hit), ``success`` (last goal reached, all in order).
-    With ``places`` there are also nearer subgoals: ``rooms_attained`` ``[N, places]`` (the room or door entered by this
-    step) and ``rooms_available`` (all but the one where the agent is); ``task.subgoals`` has their names.
+    With ``places`` there are also nearer subgoals, rooms, doors and the goals: ``rooms_attained`` (the room or door
+    entered, the goals reached by this step) and ``rooms_available`` (all but the place where the agent is; the goals
+    that are left); ``task.subgoals`` has their names.
 
     **End of episode.** All goals collected: terminated. ``max_steps`` steps: truncated.
 
@@ -47,7 +48,7 @@ class MultiGoalGridEnv(EnvBase):
         max_steps: step limit of an episode.
         obstacle: ``"stay"`` or ``"teleport"`` (a hit obstacle moves to a random free cell).
         num_obstacles: number of obstacles.
-        places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
+        places: whether rooms and doors are nearer subgoals; ``None``: as the layout has it (``"nine_rooms"``: yes).
         seed: seed of the layouts; ``None`` draws one from torch's global generator.
         device: device of all tensors.
 
@@ -115,7 +116,7 @@ class MultiGoalGridEnv(EnvBase):
         places = (
             {}
             if self.rules.places is None
-            else {key: flags(n, len(self.rules.places), device=device) for key in (ROOMS.attained, ROOMS.available)}
+            else {key: flags(n, len(self.rules.near_names), device=device) for key in (ROOMS.attained, ROOMS.available)}
         )
         self.observation_spec = Composite(
             {
@@ -153,7 +154,8 @@ class MultiGoalGridEnv(EnvBase):
         state = self.rules.place(agent, objects)
         tensordict = self.reset()
         self.state = state
-        return tensordict.update({keys.OBSERVATION: self.rules.observe(state), **self._places(state.agent)})
+        near = self._near(state.agent, tensordict[keys.ATTAINED])
+        return tensordict.update({keys.OBSERVATION: self.rules.observe(state), **near})
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -163,16 +165,17 @@ class MultiGoalGridEnv(EnvBase):
         else:
             self._renew(mask.view(self.num_envs))
         flag = torch.zeros((self.num_envs, 1), dtype=torch.bool, device=self.device)
+        no_goals = flag.repeat(1, self.rules.num_goals)
         return TensorDict(
             {
                 keys.OBSERVATION: self.rules.observe(self.state),
-                keys.ATTAINED: flag.repeat(1, self.rules.num_goals),
+                keys.ATTAINED: no_goals,
                 keys.HAZARD: flag,
                 keys.SUCCESS: flag.clone(),
                 keys.DONE: flag.clone(),
                 keys.TERMINATED: flag.clone(),
                 keys.TRUNCATED: flag.clone(),
-                **self._places(self.state.agent),
+                **self._near(self.state.agent, no_goals),
             },
             batch_size=self.batch_size,
             device=self.device,
@@ -196,12 +199,12 @@ class MultiGoalGridEnv(EnvBase):
         self.steps = self.steps + 1
         return self._outcome(before, events)
 
-    def _places(self, before: Tensor) -> dict[str, Tensor]:
-        """Entries of rooms and doors after a step from the cells ``before``, where they are subgoals."""
-        places, agent = self.rules.places, self.state.agent
-        if places is None:
+    def _near(self, before: Tensor, goals: Tensor) -> dict[str, Tensor]:
+        """Entries of nearer subgoals, if there are any, after a step from ``before`` that reached ``goals``."""
+        if self.rules.places is None:
             return {}
-        return {ROOMS.attained: places.entered(before, agent), ROOMS.available: places.elsewhere(agent)}
+        attained, available = self.rules.near_subgoals(before, self.state, goals)
+        return {ROOMS.attained: attained, ROOMS.available: available}
 
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """All worlds and the generator of their layouts: what a resumed run needs."""
@@ -256,5 +259,5 @@ class MultiGoalGridEnv(EnvBase):
         outcome = {key: column.unsqueeze(-1) for key, column in columns.items()}
         outcome[keys.OBSERVATION] = self.rules.observe(self.state)
         outcome[keys.ATTAINED] = events.attained
-        outcome.update(self._places(before))
+        outcome.update(self._near(before, events.attained))
         return TensorDict(outcome, batch_size=self.batch_size, device=self.device)

@@ -58,7 +58,7 @@ class GridRules:
         obstacle: ``"stay"`` leaves a hit obstacle where it is, ``"teleport"`` moves it to a random free cell
             (as the authors' script does).
         num_obstacles: number of obstacles.
-        places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
+        places: whether rooms and doors are nearer subgoals; ``None``: as the layout has it (``"nine_rooms"``: yes).
         device: where the tables live.
 
     Raises:
@@ -257,6 +257,29 @@ class GridRules:
         order[:, :-1].masked_fill_(self.is_wall, -1.0)
         order.scatter_(1, taken, -1.0)[:, -1] = -1.0
         return order.argmax(-1)
+
+    @property
+    def near_names(self) -> tuple[str, ...]:
+        """Names of the nearer subgoals: places, and the goals themselves, as a place alone does not lead to a goal."""
+        return (*self.places.names, *self.goal_names) if self.places is not None else ()
+
+    @property
+    def goal_names(self) -> tuple[str, ...]:
+        """``"goal 1"``, ..."""
+        return tuple(f"goal {index + 1}" for index in range(self.num_goals))
+
+    def near_subgoals(self, before: Tensor, state: GridState, attained: Tensor) -> tuple[Tensor, Tensor]:
+        """Which nearer subgoals a step attained, and which are worth choosing now, ``[N, len(near_names)]`` bool.
+
+        Args:
+            before: cells of the agents before the step ``[N]``.
+            state: after it.
+            attained: goals that it attained ``[N, K]``.
+        """
+        assert self.places is not None
+        entered, elsewhere = self.places.entered(before, state.agent), self.places.elsewhere(state.agent)
+        left = state.objects[:, self.num_obstacles :] != self.nowhere
+        return torch.cat([entered, attained], -1), torch.cat([elsewhere, left], -1)
 
     def observe(self, state: GridState) -> Tensor:
         """The window around each agent, ``[N, view, view]`` uint8 codes (:mod:`~hdrqn_torchrl.envs.grid.cells`)."""

@@ -18,7 +18,7 @@ from hdrqn_torchrl.envs.task import Figures, Reference, Task
 if TYPE_CHECKING:
     from hdrqn_torchrl.envs.scene import Scene
 
-ROOMS = keys.OptionKeys("rooms")  # of rooms and doors
+ROOMS = keys.OptionKeys("rooms")  # of rooms, doors and goals as nearer subgoals
 PLAYERS = {
     "planner": "full information",
     "memory": "perfect memory of the agent's own view",
@@ -50,11 +50,11 @@ def grid_task(rules: GridRules, settings: Mapping[str, Any]) -> Task:
 
 
 def subgoals_of(rules: GridRules) -> tuple[SubgoalSet, ...]:
-    """The sets of subgoals of a grid task, from near to far: rooms and doors if they are subgoals, then the goals."""
-    goals = SubgoalSet(names=tuple(f"goal {index + 1}" for index in range(rules.num_goals)))
+    """The sets of subgoals of a grid task, from near to far: rooms, doors and goals if there are rooms; the goals."""
+    goals = SubgoalSet(names=rules.goal_names)
     if rules.places is None:
         return (goals,)
-    return SubgoalSet(names=rules.places.names, prefix=ROOMS.prefix, repeatable=True), goals
+    return SubgoalSet(names=rules.near_names, prefix=ROOMS.prefix, repeatable=True), goals
 
 
 def grid_scene(env: EnvBase, *, subgoal: int | None = None, action: int | None = None) -> Scene:

@@ -41,7 +41,7 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
         max_steps: step limit of an episode.
         obstacle: ``"stay"`` or ``"teleport"`` (a hit obstacle moves to a random free cell).
         num_obstacles: number of obstacles.
-        places: whether rooms and doors are subgoals, too; ``None``: as the layout has it (``"nine_rooms"``: yes).
+        places: whether rooms and doors are nearer subgoals; ``None``: as the layout has it (``"nine_rooms"``: yes).
         render_mode: ``"rgb_array"`` or ``None``.
 
     Raises:
@@ -165,9 +165,9 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
             "hazard": bool(events.hazard),
             "is_success": bool(events.success),
         }
-        if (places := self.rules.places) is not None:
-            info[ROOMS.attained] = places.entered(before, self.state.agent)[0].numpy()
-            info[ROOMS.available] = places.elsewhere(self.state.agent)[0].numpy()
+        if self.rules.places is not None:
+            attained, available = self.rules.near_subgoals(before, self.state, events.attained)
+            info[ROOMS.attained], info[ROOMS.available] = attained[0].numpy(), available[0].numpy()
         return info
 
 

@@ -62,7 +62,7 @@ def test_a_place_is_attained_by_the_step_that_enters_it_and_is_not_available_whi
     env = MultiGoalGridEnv(6, layout="nine_rooms", max_steps=10_000, num_obstacles=0, num_goals=1, seed=0)
     tensordict, entered = env.reset(), set()
     env.state = env.state._replace(objects=torch.full((6, 1), env.rules.nowhere))  # without a goal there is no end
-    names, chance = env.task.subgoals[0].names, random.Random(0)
+    names, chance = env.rules.places.names, random.Random(0)
     walkers = [Walker(*divmod(cell, env.rules.width)) for cell in env.state.agent.tolist()]
     assert not tensordict["rooms_attained"].any()
     for _ in range(3000):
@@ -70,11 +70,25 @@ def test_a_place_is_attained_by_the_step_that_enters_it_and_is_not_available_whi
         expected = [walker.move(action) for walker, action in zip(walkers, actions, strict=True)]
         after = env.step(tensordict.set("action", torch.tensor(actions)))["next"]
         attained = [[name == place for name in names] for place in expected]
-        assert after["rooms_attained"].tolist() == attained
-        assert after["rooms_available"].tolist() == [[name != walker.place() for name in names] for walker in walkers]
+        assert after["rooms_attained"][:, :-1].tolist() == attained
+        assert after["rooms_available"][:, :-1].tolist() == [
+            [name != walker.place() for name in names] for walker in walkers
+        ]
         entered |= set(expected)
         tensordict = after.exclude("reward", "extrinsic_reward")
     assert entered == {*names, None}
+
+
+def test_goals_are_nearer_subgoals_as_well_as_a_place_alone_does_not_lead_to_one():
+    env = MultiGoalGridEnv(64, layout="nine_rooms", seed=0)
+    step = env.rollout(150, break_when_any_done=False)
+    assert torch.equal(step["next", "rooms_attained"][..., 21:], step["next", "attained"])
+    taken = step["next", "attained"].any(1)
+    assert taken.any() and env.task.subgoals[0].names[21:] == ("goal 1", "goal 2")
+    after = step["next", "rooms_available"][..., 21:]
+    assert not (after & step["next", "attained"]).any(), "what was just taken is not worth choosing"
+    gone = ~step["rooms_available"][..., 21:]
+    assert not (gone & step["next", "attained"]).any() and gone.any()
 
 
 def test_after_a_reset_all_places_but_the_start_are_available():
@@ -82,7 +96,7 @@ def test_after_a_reset_all_places_but_the_start_are_available():
     for begin in (env.reset, lambda: env.set_world(env.state.agent.flip(0), env.state.objects.flip(0))):
         start = begin()
         expected = env.rules.places.of_cell[env.state.agent][:, None] != torch.arange(21)
-        assert (start["rooms_available"] == expected).all()
+        assert (start["rooms_available"][:, :21] == expected).all() and start["rooms_available"][:, 21:].all()
 
 
 def test_goals_lie_in_other_rooms_than_the_start_and_nothing_stands_in_a_door():
@@ -102,7 +116,7 @@ def test_goals_lie_in_other_rooms_than_the_start_and_nothing_stands_in_a_door():
 def test_other_layouts_have_places_only_on_request_and_the_same_worlds():
     plain, rooms = (MultiGoalGridEnv(4, layout="four_rooms", seed=0, places=places) for places in (None, True))
     assert "rooms_attained" not in plain.observation_spec and len(task_of(plain).subgoals) == 1
-    assert task_of(rooms).subgoals[0].names[4:] == ("door 1-2", "door 1-3", "door 2-4", "door 3-4")
+    assert task_of(rooms).subgoals[0].names[4:] == ("door 1-2", "door 1-3", "door 2-4", "door 3-4", "goal 1", "goal 2")
     assert (plain.rollout(5)["observation"][:, 0] == rooms.rollout(5)["observation"][:, 0]).all()
 
 
@@ -115,7 +129,7 @@ def test_nine_rooms_without_places_are_the_same_worlds_with_one_set_of_subgoals(
 
 def test_the_two_sets_of_subgoals_are_named_from_near_to_far():
     near, far = task_of(MultiGoalGridEnv(2, layout="nine_rooms", num_goals=3)).subgoals
-    assert (near.prefix, near.repeatable, len(near)) == ("rooms", True, 21)
+    assert (near.prefix, near.repeatable, len(near)) == ("rooms", True, 24)
     assert (far.prefix, far.repeatable, far.names) == ("", False, ("goal 1", "goal 2", "goal 3"))
 
 
