@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 from hydra import compose, initialize_config_dir
@@ -188,7 +189,8 @@ class Job:
         )
 
 
-def jobs_of(experiment: str) -> list[Job]:
+@cache
+def jobs_of(experiment: str) -> tuple[Job, ...]:
     """Every run that ``python train.py -m experiment=...`` starts.
 
     Args:
@@ -212,7 +214,7 @@ def jobs_of(experiment: str) -> list[Job]:
                 for key, value in given:
                     OmegaConf.update(config, key, parser.parse_override(f"{key}={value}").value(), force_add=True)
                 jobs.append(Job(dict([*chosen, *given]), flat(plain(config), without=NOT_LEARNED_FROM)))
-    return jobs
+    return tuple(jobs)
 
 
 def is_run_of(job: Job, run: dict[str, Any]) -> bool:

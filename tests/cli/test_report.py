@@ -1,12 +1,15 @@
 import json
 import re
+import shutil
 import sys
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
+from PIL import Image
 
 from hdrqn_torchrl.analysis.claims import Near
 from hdrqn_torchrl.cli import findings, report
@@ -21,14 +24,20 @@ COLUMNS = (
 EXPERIMENTS = sorted(path.stem for path in (Path(CONF) / "experiment" / "paper").glob("*.yaml"))
 
 
-def make_run(folder, *overrides, score=1.0, finished=True):
-    """A run folder as train.py writes it."""
-    folder.mkdir(parents=True)
+@cache
+def composed(*overrides):
+    """The text of a run's config.yaml, and Hydra's choices of files."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=list(overrides), return_hydra_config=True)
     choices = {str(key): value for key, value in config.hydra.runtime.choices.items()}
-    config = OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(config))
+    return OmegaConf.to_yaml(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])), choices
+
+
+def make_run(folder, *overrides, score=1.0, finished=True):
+    """A run folder as train.py writes it."""
+    folder.mkdir(parents=True)
+    config, choices = composed(*overrides)
+    (folder / "config.yaml").write_text(config)
     (folder / "run.json").write_text(json.dumps({"choices": choices, "commit": "0123456789"}))
     rows = [f"{i * 100},{i * 7},{i * 10},{i * 60.5},{score * i},{50 - i},{score * i},{i / 4},20" for i in range(5)]
     (folder / "metrics.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
@@ -55,15 +64,36 @@ def run(monkeypatch, tmp_path, capsys):
 
 
 @pytest.fixture
-def outputs(tmp_path):
-    study = "experiment=gridworld"
+def without_figures(monkeypatch):
+    """Figures of one pixel, for tests that only read text."""
+
+    def plot_curves(_, paths, **settings):
+        for path in paths:
+            Image.new("RGB", (1, 1)).save(path)
+
+    monkeypatch.setattr(report, "plot_curves", plot_curves)
+    monkeypatch.setattr(report, "plot_legs_over_time", lambda run, names, path: plot_curves(None, [path]))
+
+
+text_only = pytest.mark.usefixtures("without_figures")
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory):
+    """Runs of a study: six finished, one unfinished, and one that does not belong to it."""
+    folder, experiment = tmp_path_factory.mktemp("study"), "experiment=gridworld"
     for algo, score in (("v2", 1.6), ("v1", 1.2), ("dqn", 0.2)):
         for seed in (0, 1):
-            made = f"outputs/{algo}-seed{seed}"
-            make_run(tmp_path / made, study, f"algo={algo}", f"seed={seed}", score=score + seed / 100)
-    make_run(tmp_path / "outputs/hdqn", study, "algo=hdqn", finished=False)
-    make_run(tmp_path / "outputs/other", study, "algo=v2", "algo.gamma=0.9", score=9.0)
-    return tmp_path / "outputs"
+            overrides = experiment, f"algo={algo}", f"seed={seed}"
+            make_run(folder / f"{algo}-seed{seed}", *overrides, score=score + seed / 100)
+    make_run(folder / "hdqn", experiment, "algo=hdqn", finished=False)
+    make_run(folder / "other", experiment, "algo=v2", "algo.gamma=0.9", score=9.0)
+    return folder
+
+
+@pytest.fixture
+def outputs(study, tmp_path):
+    return shutil.copytree(study, tmp_path / "outputs")
 
 
 def test_a_report_holds_figures_tables_and_claims_of_a_study(run, outputs):
@@ -82,6 +112,7 @@ def test_a_report_holds_figures_tables_and_claims_of_a_study(run, outputs):
     assert "(results/gridworld.png)" in text
 
 
+@text_only
 def test_claims_are_checked_against_finished_runs(run, outputs):
     for algo, score in (("hdqn", 0.8), ("drqn", 0.3)):
         make_run(outputs / f"done-{algo}", "experiment=gridworld", f"algo={algo}", score=score)
@@ -92,6 +123,7 @@ def test_claims_are_checked_against_finished_runs(run, outputs):
     assert "claims small" not in text  # of some studies alone there is no overview
 
 
+@text_only
 def test_a_report_on_all_studies_begins_with_an_overview_of_claims(run, outputs):
     run("runs=outputs", "out=results.md")
     overview = Path("results.md").read_text().partition("<!-- claims small -->")[2]
@@ -102,6 +134,7 @@ def test_a_report_on_all_studies_begins_with_an_overview_of_claims(run, outputs)
     )
 
 
+@text_only
 def test_text_outside_the_marks_is_left_unchanged(run, outputs):
     run("runs=outputs", "out=results.md", "studies=gridworld")
     generated = Path("results.md").read_text()
@@ -119,6 +152,7 @@ def test_an_archive_gives_the_same_report(run, outputs):
     assert (Path("a") / "gridworld.png").read_bytes() == (Path("b") / "gridworld.png").read_bytes()
 
 
+@text_only
 def test_a_study_has_a_row_for_each_value_and_shows_other_agents_for_comparison(run, tmp_path):
     for algo in ("v1", "v2"):
         for length in (1, 8):
@@ -130,6 +164,7 @@ def test_a_study_has_a_row_for_each_value_and_shows_other_agents_for_comparison(
     assert text.index("**v1**") < text.index("| slice_len=1 |") < text.index("| v3 |") < text.index("**v2**")
 
 
+@text_only
 def test_a_run_has_the_label_that_its_study_gives_it(run, outputs):
     """The variant v2 of one study is the algorithm v2 of another."""
     make_run(outputs / "cell", "experiment=authors_choices", "variant=v2_cell")
@@ -173,6 +208,7 @@ class TestScreen:
         for name in ("montezuma", "montezuma_right", "montezuma_left", "montezuma_legs_v3"):
             assert f"(results/{name}.png)" in text and (Path("results") / f"{name}.png").stat().st_size > 100
 
+    @text_only
     def test_an_archive_keeps_evaluations_of_the_screen(self, run, folder):
         run("runs=outputs", "out=a.md", "studies=montezuma", "keep=runs.tar.xz")
         run("runs=runs.tar.xz", "out=b.md", "studies=montezuma")
