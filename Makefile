@@ -2,6 +2,8 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 ARGS ?=
+# Processes that `make test` shares the tests among, 2 GB each. Plain `pytest -m 'not slow'` does without.
+WORKERS ?= 2
 
 .PHONY: setup train test test-slow lint examples clean
 
@@ -17,7 +19,7 @@ train: setup
 	$(BIN)/python train.py env=gridworld algo=v2 $(ARGS)
 
 test: setup lint examples
-	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
+	$(BIN)/python -m pytest -m 'not slow' -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow $(ARGS)
