@@ -1,10 +1,20 @@
 """One thread and one seed for every test."""
 
+import os
+
 import pytest
 import torch
 from matplotlib.figure import Figure
 
 torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def memory_for_disk():
+    """Skips fsync, which takes most of the time of a small checkpoint and protects from losses of power only."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -5,8 +5,6 @@ import os
 import shutil
 import signal
 import struct
-import subprocess
-import sys
 import time
 import zlib
 from contextlib import ExitStack, contextmanager
@@ -14,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 import pytest
 import torch
 import yaml
-from processes import ROOT
+from processes import run_script
 from programs import TINY, TINY_HDRQN
 from safetensors.torch import load_file, save_file
 from torchrl.checkpoint import CheckpointError
@@ -35,8 +33,8 @@ def valid(tmp_path_factory):
     """A small run of train.py, with two checkpoints and a memory drawn from by priority."""
     folder = tmp_path_factory.mktemp("valid")
     learners = [f"algo.{level}.{setting}" for level in ("sub", "meta") for setting in ("priority_exponent=0.9",)]
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, *TINY_HDRQN, *learners, "logger=csv", "hydra.run.dir=run"]
-    subprocess.run(command, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True, capture_output=True)
+    code, _, told = run_script(folder, *TINY, *TINY_HDRQN, *learners, "logger=csv", "hydra.run.dir=run")
+    assert code == 0, told
     return folder / "run"
 
 

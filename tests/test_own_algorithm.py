@@ -7,8 +7,8 @@ import json
 import pytest
 import torch
 from helpers import small_env
-from processes import ROOT
-from programs import TINY, TINY_HDRQN, call
+from processes import ROOT, run_script
+from programs import TINY, TINY_HDRQN
 
 from examples.own_algorithm.soft_v2 import SoftEpsilonGreedy, make_soft_v2
 from hdrqn_torchrl.modules import compact_network
@@ -17,9 +17,10 @@ TARGET = "examples.own_algorithm.soft_v2.make_soft_v2"
 
 
 def test_a_users_algorithm_trains_from_the_command_line(tmp_path):
-    command = ["train.py", "--config-dir", "examples/own_algorithm", "algo=soft_v2", "logger=csv", *TINY, *TINY_HDRQN]
-    done = call(ROOT, *command, f"allowed_targets=[{TARGET}]", "algo.temperature=0.25", f"hydra.run.dir={tmp_path}/run")
-    assert done.returncode == 0, done.stderr
+    command = ["--config-dir", str(ROOT / "examples/own_algorithm"), "algo=soft_v2", "logger=csv", *TINY, *TINY_HDRQN]
+    command += [f"allowed_targets=[{TARGET}]", "algo.temperature=0.25", "hydra.run.dir=run"]
+    code, _, told = run_script(tmp_path, *command)
+    assert code == 0, told
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert summary["frames"] >= 2_000 and summary["updates"] > 0
     assert "temperature: 0.25" in (tmp_path / "run/config.yaml").read_text()

@@ -1,6 +1,5 @@
 """A training that was stopped and resumed equals an uninterrupted one bit for bit."""
 
-import os
 import random
 import shutil
 import signal
@@ -148,17 +147,10 @@ CUTS = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
-def memory_for_disk():
-    """Skips fsync, which takes most of the time of a small checkpoint and does not matter here."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(os, "fsync", lambda _: None)
-        yield
-
-
 FEW = ("between two updates", "in the middle of options", "with full memories")
-PAIRS = [(training, cut) for training in ("drqn", "v1", "v2") for cut in CUTS]
-PAIRS += [(training, cut) for training in ("v2-odd", "v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
+PAIRS = [("v2", cut) for cut in CUTS]  # what they cut is the same code for all
+PAIRS += [(training, cut) for training in ("drqn", "v1", "v2-odd", "v2-refreshed", "v2-hindsight", "v3") for cut in FEW]
+PAIRS += [(training, "in an evaluation") for training in ("drqn", "v1")]
 PAIRS += [(training, "in the middle of options") for training in ("v1-three-levels", "v2-three-levels")]
 PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of metrics", *FEW[1:])]
 PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole", "levels"))]

@@ -2,13 +2,11 @@
 
 import csv
 import json
-import os
-import subprocess
 import sys
 
 import numpy as np
 import pytest
-from processes import ROOT
+from processes import run_script
 from programs import TINY_HDRQN
 from user_envs import Pictured
 
@@ -25,19 +23,17 @@ TASK = [
     *("evaluation.num_envs=4", "evaluation.episodes=4", "evaluation.final_episodes=4", "network.hidden_size=8"),
     *("evaluation.interval_frames=500", "network.widths=[8]"),
 ]
-HERE = {"OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
 
 
 def train(folder, *arguments):
-    command = [sys.executable, str(ROOT / "train.py"), *TASK, *arguments, "hydra.run.dir=run"]
-    return subprocess.run(command, cwd=folder, env=os.environ | HERE, capture_output=True, text=True, timeout=300)
+    return run_script(folder, *TASK, *arguments, "hydra.run.dir=run")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    ended = train(folder, *TINY_HDRQN, "+env.length=null", "evaluation.max_steps=20")
-    assert ended.returncode == 0, ended.stderr
+    code, _, told = train(folder, *TINY_HDRQN, "+env.length=null", "evaluation.max_steps=20")
+    assert code == 0, told
     return folder / "run"
 
 
@@ -85,7 +81,7 @@ def test_repeatable_subgoals_stay_available_and_rendered_pictures_are_watched(al
 
 
 def test_missing_entries_are_reported_before_anything_is_trained(tmp_path):
-    ended = train(tmp_path, "algo=v3", "+env.without=[attained,success]")
-    assert ended.returncode == 1 and "Traceback" not in ended.stderr
-    assert "error: algo.env must have what make_v3 reads:" in ended.stderr
-    assert "'attained' must be [4, G] bool, it is missing" in ended.stderr
+    code, _, told = train(tmp_path, "algo=v3", "+env.without=[attained,success]")
+    assert code == 1 and "Traceback" not in told
+    assert "error: algo.env must have what make_v3 reads:" in told
+    assert "'attained' must be [4, G] bool, it is missing" in told

@@ -26,8 +26,7 @@ from hdrqn_torchrl.runs.building import build_algorithm
 NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
 
 
-@pytest.mark.parametrize("layout", ["open", "four_rooms"])
-@pytest.mark.parametrize("network", NETWORKS)
+@pytest.mark.parametrize(("network", "layout"), [("compact", "open"), ("paper", "four_rooms")])
 @pytest.mark.parametrize(
     ("name", "options"),
     [

@@ -1,12 +1,10 @@
 """evaluate.py on a run of train.py."""
 
 import json
-import os
-import subprocess
 import sys
 
 import pytest
-from processes import ROOT
+from processes import run_script
 from programs import TINY, TINY_HDRQN
 
 from hdrqn_torchrl.cli import evaluate
@@ -16,8 +14,8 @@ from hdrqn_torchrl.cli.command_line import command_line
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, *TINY_HDRQN, "logger=csv", "hydra.run.dir=run"]
-    subprocess.run(command, cwd=folder, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True, capture_output=True)
+    code, _, told = run_script(folder, *TINY, *TINY_HDRQN, "logger=csv", "hydra.run.dir=run")
+    assert code == 0, told
     return folder / "run"
 
 

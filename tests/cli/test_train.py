@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 import time
-from functools import partial
+from functools import cache, partial
 
 import pytest
 import torch
@@ -45,6 +45,11 @@ def configure(*overrides):
         return compose("config", overrides=list(overrides))
 
 
+@cache
+def usual():
+    return configure()
+
+
 class TestTree:
     @pytest.mark.parametrize("network", choices("network"))
     @pytest.mark.parametrize("algo", choices("algo"))
@@ -64,8 +69,8 @@ class TestTree:
 
     @pytest.mark.parametrize("experiment", choices("experiment"))
     def test_every_experiment_composes_and_builds(self, experiment):
-        plain, config = configure(), configure(f"experiment={experiment}")
-        assert config != plain
+        config = configure(f"experiment={experiment}")
+        assert config != usual()
         settings = resolved(config)
         train.check(settings)
         assert build_algorithm(settings, {"num_envs": 2})[1].learners
@@ -205,10 +210,10 @@ def test_a_run_leaves_a_complete_folder(tmp_path):
 
 
 def test_a_sweep_runs_one_job_after_the_other(tmp_path):
-    script, tiny = str(ROOT / "train.py"), [setting for setting in TINY if "total_frames" not in setting]
+    tiny = [setting for setting in TINY if "total_frames" not in setting]
     sweep = ["-m", "algo=hdqn,v1", "seed=5", "hydra.sweep.dir=sweep", "logger=csv", "total_frames=600"]
-    done = call(tmp_path, script, *sweep, *tiny, *TINY_HDRQN)
-    assert done.returncode == 0, done.stderr
+    code, _, told = run_script(tmp_path, *sweep, *tiny, *TINY_HDRQN)
+    assert code == 0, told
     folders = sorted(path for path in (tmp_path / "sweep").iterdir() if path.is_dir())
     assert [folder.name for folder in folders] == ["0-gridworld-hdqn-seed5", "1-gridworld-v1-seed5"]
     for folder, recurrent in zip(folders, (False, True), strict=True):
