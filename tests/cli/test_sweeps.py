@@ -13,7 +13,6 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
-from processes import run_script
 from programs import CONF, ROOT, TINY, TINY_HDRQN, call
 
 from hdrqn_torchrl.cli import sweeps
@@ -88,13 +87,12 @@ def test_a_serial_sweep_gives_the_same_and_survives_failed_jobs(parallel, tmp_pa
 
 def test_a_search_maximises_and_survives_failed_trials(tmp_path):
     # Without -m: sweep=search alone says that this is a sweep.
-    search = ["sweep=search", "hydra.sweeper.n_trials=4", "algo.gamma=choice(0.9,7)", "algo.sub.tau=0.02"]
-    code, _, told = run_script(tmp_path, *search, *COMMON)
+    done = sweep(tmp_path, "sweep=search", "hydra.sweeper.n_trials=4", "algo.gamma=choice(0.9,7)", "algo.sub.tau=0.02")
     notes = sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl")
     failed = sweeps.unfinished(notes)
     assert len(notes) == 4 and 0 < len(failed) < 4
-    assert all(WRONG in note["state"] for note in failed) and f"unfinished: {len(failed)} of 4" in told
-    assert code == 1
+    assert all(WRONG in note["state"] for note in failed) and f"unfinished: {len(failed)} of 4" in done.stderr
+    assert done.returncode == 1
     returns = [json.loads(path.read_text())["return_mean"] for path in tmp_path.glob("sweep/*/summary.json")]
     best = OmegaConf.load(tmp_path / "sweep" / "optimization_results.yaml")
     assert best.best_value == pytest.approx(max(returns))
