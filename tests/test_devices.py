@@ -252,7 +252,7 @@ class TestEverythingIsOnOneDevice:
     def simple_learner(self, monkeypatch):
         """The meta device has no fused Adam, and TorchRL compares addresses."""
         monkeypatch.setattr(torch.optim, "Adam", lambda parameters, **_: torch.optim.SGD(parameters))
-        monkeypatch.setattr(learner_module, "SoftUpdate", lambda *_, **__: None)
+        monkeypatch.setattr(learner_module, "SoftTargetUpdate", lambda *_, **__: None)
 
     @staticmethod
     def devices(td):

@@ -24,6 +24,7 @@ from omegaconf import OmegaConf
 from hdrqn_torchrl.cli.configuration import plain
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.building import default_of
 from hdrqn_torchrl.runs.commands import command_of
 from hdrqn_torchrl.runs.comparing import BOOKKEEPING, flat
 from hdrqn_torchrl.runs.reading import read_choices, read_config
@@ -231,12 +232,15 @@ def refuse_going_back(checkpoint: Path) -> None:
 
 
 def differences(stored: Settings, config: Settings) -> list[str]:
-    """Settings that changed, one line each. Raising ``total_frames`` does not count, nor does what follows it."""
+    """Settings that changed, one line each. Raising ``total_frames`` does not count, nor does what follows it.
+
+    A setting that only one of them has, as the other is of an earlier version, has its builder's default there.
+    """
     before, after = (flat(_without_copies(deepcopy(each)), without=BOOKKEEPING) for each in (stored, config))
     frames = before.pop("total_frames"), after.pop("total_frames")
     changed = [f"total_frames: {frames[0]} -> {frames[1]} (it can only be raised)"] if frames[1] < frames[0] else []
     for key in sorted(before.keys() | after.keys()):
-        old, new = before.get(key, "(not set)"), after.get(key, "(not set)")
+        old, new = (each[key] if key in each else default_of(config, key, "(not set)") for each in (before, after))
         follows = key.endswith(FOLLOWS) and (old, new) == frames
         if old != new and not follows:
             changed.append(f"{key}: {old} -> {new}")

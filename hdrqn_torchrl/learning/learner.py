@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
+from torchrl.objectives import HardUpdate, LossModule
 
 from hdrqn_torchrl.data import Continuity, sample_sequences
 from hdrqn_torchrl.learning.finite import FiniteGuard
@@ -20,6 +20,7 @@ from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision, matrix_products
 from hdrqn_torchrl.learning.settings import LearnerSettings
 from hdrqn_torchrl.learning.stored import check_counters, holds_inputs_twice
+from hdrqn_torchrl.learning.target_network import SoftTargetUpdate
 
 
 class Learner:
@@ -64,7 +65,7 @@ class Learner:
         self.loss = loss
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
-        self.target_updater = SoftUpdate(self.loss, tau=settings.tau)
+        self.target_updater = SoftTargetUpdate(self.loss, tau=settings.tau)
         self._parameters = dict(network.named_parameters())
         self.device = next(iter(self._parameters.values())).device
         self.precision = choose_precision(settings.precision, network)

@@ -15,7 +15,7 @@ from torchrl.modules import set_recurrent_mode
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import ObservationPredictor
 from hdrqn_torchrl.objectives.base import LossFunction, SequenceLoss, masked_mean
-from hdrqn_torchrl.objectives.sequences import Sequences, step_of, stored_once, stored_twice
+from hdrqn_torchrl.objectives.sequences import Sequences, step_of, take_apart
 from hdrqn_torchrl.objectives.targets import (
     check_returns,
     greedy_choice,
@@ -211,12 +211,13 @@ class RecurrentDQNLoss(SequenceLoss):
             trained = usable & self._warm(parts.valid, parts.init, parts.lookahead)
         loss = self._distance(chosen, wanted, trained, tensordict.get(k.priority_weight, None))
         with torch.no_grad():
+            error = wanted - chosen
             report = {
-                "td_error": masked_mean((wanted - chosen).abs(), trained),
+                "td_error": masked_mean(error.abs(), trained),
                 "q_value": masked_mean(chosen, trained),
                 "target": masked_mean(wanted, trained),
                 "trained_steps": trained.sum(),
-                "priority": sequence_priority(wanted - chosen, trained),
+                "priority": sequence_priority(error, trained),
             }
         if self._predicts and memory is not None:
             ends, seen = step_of(after[k.episode_done], steps), parts.seen
@@ -262,7 +263,6 @@ class RecurrentDQNLoss(SequenceLoss):
     def _take_apart(self, tensordict: TensorDictBase) -> Sequences:
         """Inputs and steps of sequences of either form."""
         k, reads_next = self.tensor_keys, tensordict.get(("next", self._input_keys[0]), None) is not None
-        take_apart = stored_twice if reads_next or not self.lookahead else stored_once
         return take_apart(
             tensordict,
             self._valid(tensordict),
@@ -271,6 +271,7 @@ class RecurrentDQNLoss(SequenceLoss):
             init_key=k.init,
             done_key=k.done,
             lookahead=self.lookahead,
+            stored_once=self.lookahead > 0 and not reads_next,
         )
 
     @property
@@ -285,5 +286,5 @@ class RecurrentDQNLoss(SequenceLoss):
         with set_recurrent_mode(True):
             with torch.no_grad():
                 target = target_network(inputs.copy()).get(key)
-            online = network(inputs.copy())
+            online = network(inputs)
         return online.get(key), target, online.get(self.tensor_keys.memory, None)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -32,7 +32,7 @@ class Sequences(NamedTuple):
     """How many steps at the end are there for the targets of others only."""
 
 
-def stored_once(
+def take_apart(
     tensordict: TensorDictBase,
     valid: Tensor,
     *,
@@ -41,69 +41,57 @@ def stored_once(
     init_key: NestedKey,
     done_key: NestedKey,
     lookahead: int,
+    stored_once: bool,
 ) -> Sequences:
-    """Takes apart sequences ``[B, T + 1]`` that hold their inputs at the root only.
+    """Takes apart replayed sequences.
 
     Args:
-        tensordict: the sequences.
-        valid: which of their steps are not padding, ``[B, T + 1]`` bool.
+        tensordict: the sequences. If ``stored_once``, ``[B, T + 1]``, with inputs at the root only; otherwise standard
+            ones, ``[B, T]``: what followed the last valid step stands under its ``"next"``.
+        valid: which of their steps are not padding, bool.
         read_keys: inputs; those that are numbers are cleared in padding.
         state_keys: recurrent states, zero where ``init_key`` is set and in padding.
         init_key: where the state restarts.
         done_key: under ``"next"``, where a segment ends.
-        lookahead: steps at the end that are not trained, the last one included.
+        lookahead: steps at the end that are not trained; if ``stored_once``, the last one is among them.
+        stored_once: the form.
     """
     init, done = _flag(tensordict, init_key) & valid, _flag(tensordict["next"], done_key)
-    inputs = TensorDict({}, tensordict.batch_size, device=tensordict.device)
-    padding = _padding(valid)
-    for key in read_keys:
-        stream = tensordict[key]
-        if padding is not None and stream.is_floating_point():
-            stream = stream.masked_fill(_expand(padding, stream), 0.0)
-        inputs.set(key, stream)
-    for key in state_keys:
-        inputs.set(key, _first_states(tensordict[key], init | ~valid))
-    inputs.set(init_key, init.unsqueeze(-1))
-    cut = (done | last_real(valid))[:, :-1] | init[:, 1:]
-    return Sequences(inputs, valid, tensordict[:, :-1], valid[:, :-1], init[:, :-1], cut, lookahead - 1)
-
-
-def stored_twice(
-    tensordict: TensorDictBase,
-    valid: Tensor,
-    *,
-    read_keys: Sequence[NestedKey],
-    state_keys: Sequence[NestedKey],
-    init_key: NestedKey,
-    done_key: NestedKey,
-    lookahead: int,
-) -> Sequences:
-    """Takes apart standard sequences ``[B, T]``: what followed the last valid step stands under its ``"next"``.
-
-    Args:
-        tensordict: the sequences.
-        valid: which of their steps are not padding, ``[B, T]`` bool.
-        read_keys, state_keys, init_key, done_key: as in :func:`stored_once`.
-        lookahead: steps at the end that are not trained.
-    """
-    init, done = _flag(tensordict, init_key) & valid, _flag(tensordict["next"], done_key)
-    own, reached = _with_nothing(valid, at="end"), _with_nothing(valid, at="start")  # seen at, or after, a valid step
-    inputs = TensorDict({}, (tensordict.shape[0], tensordict.shape[1] + 1), device=tensordict.device)
-    padding = _padding(own | reached)
-    for key in read_keys:
-        now, following = tensordict[key], tensordict[unravel_key(("next", key))]
-        stream = torch.cat([now, following[:, -1:]], 1)
-        if padding is not None:
-            stream = torch.where(_expand(own, stream), stream, torch.cat([now[:, :1], following], 1))
-            if stream.is_floating_point():
-                stream = stream.masked_fill(_expand(padding, stream), 0.0)
-        inputs.set(key, stream)
-    for key in state_keys:
-        state = _first_states(tensordict[key], init | ~valid)
-        inputs.set(key, torch.cat([state, torch.zeros_like(state[:, :1])], 1))
-    inputs.set(init_key, _with_nothing(init, at="end").unsqueeze(-1))
+    read = {key: tensordict[key] for key in read_keys}
+    states = {key: _clear(tensordict[key], init | ~valid) for key in state_keys}
+    if stored_once:
+        inputs = _inputs(read, {**states, init_key: init.unsqueeze(-1)}, valid, tensordict.device)
+        cut = done[:, :-1] | ~valid[:, 1:] | init[:, 1:]
+        return Sequences(inputs, valid, tensordict[:, :-1], valid[:, :-1], init[:, :-1], cut, lookahead - 1)
     seen = torch.cat([valid[:, :1], valid], 1)
+    read = {key: _joined(now, tensordict[unravel_key(("next", key))], valid) for key, now in read.items()}
+    states = {key: _with_nothing(state) for key, state in states.items()}
+    kept = {**states, init_key: _with_nothing(init).unsqueeze(-1)}
+    inputs = _inputs(read, kept, seen, tensordict.device)
     return Sequences(inputs, seen, tensordict, valid, init, done & ~last_real(valid), lookahead)
+
+
+def _inputs(
+    read: Mapping[NestedKey, Tensor],
+    kept: Mapping[NestedKey, Tensor],
+    seen: Tensor,
+    device: torch.device | None,
+) -> TensorDict:
+    """Inputs ``read``, cleared in padding, and those that are ``kept`` as they are."""
+    inputs, padding = TensorDict({}, seen.shape, device=device), _padding(seen)
+    for key, stream in read.items():
+        inputs.set(key, stream if padding is None or not stream.is_floating_point() else _clear(stream, padding))
+    for key, value in kept.items():
+        inputs.set(key, value)
+    return inputs
+
+
+def _joined(now: Tensor, following: Tensor, valid: Tensor) -> Tensor:
+    """The T + 1 inputs of T steps; after the last valid one stands what followed it."""
+    stream = torch.cat([now, following[:, -1:]], 1)
+    if _padding(valid) is None:
+        return stream
+    return torch.where(_expand(_with_nothing(valid), stream), stream, torch.cat([now[:, :1], following], 1))
 
 
 def step_of(value: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -131,15 +119,14 @@ def _padding(valid: Tensor) -> Tensor | None:
     return None if on_host(valid) and bool(valid.all()) else ~valid
 
 
-def _first_states(state: Tensor, void: Tensor) -> Tensor:
-    """Stored states ``[B, T, ...]``, zero where they are ``void``."""
-    return state.masked_fill(_expand(void, state), 0.0)
+def _clear(value: Tensor, void: Tensor) -> Tensor:
+    """Entries ``[B, T, ...]``, zero where they are ``void``."""
+    return value.masked_fill(_expand(void, value), 0.0)
 
 
-def _with_nothing(mask: Tensor, *, at: Literal["start", "end"]) -> Tensor:
-    """A mask ``[B, T]`` with one more step, where it is false."""
-    nothing = torch.zeros_like(mask[:, :1])
-    return torch.cat([nothing, mask] if at == "start" else [mask, nothing], 1)
+def _with_nothing(value: Tensor) -> Tensor:
+    """Entries ``[B, T, ...]`` with one more step at the end, where they are zero or false."""
+    return torch.cat([value, torch.zeros_like(value[:, :1])], 1)
 
 
 def _expand(mask: Tensor, like: Tensor) -> Tensor:

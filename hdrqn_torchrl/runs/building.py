@@ -5,6 +5,7 @@ What may be built is decided in trust.py, what type each setting must have in ar
 
 from __future__ import annotations
 
+import inspect
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -88,6 +89,28 @@ def locate(target: str) -> Callable[..., Any]:
     if not callable(found):
         raise SettingsError(f"_target_ must name a function or class, got {target!r}, which is neither.")
     return found
+
+
+def default_of(settings: Settings, name: str, otherwise: Any = None) -> Any:
+    """What a setting is where it is left out: its builder's default.
+
+    Args:
+        settings: all of a run, with builders that may be loaded.
+        name: full name of the setting.
+        otherwise: returned if no builder takes it, or it has no default.
+
+    Examples:
+        >>> default_of({"algo": {"_target_": "hdrqn_torchrl.algorithms.make_hdrqn"}}, "algo.levels")
+        2
+    """
+    *path, last = name.split(".")
+    node: Any = settings
+    for part in path:
+        node = node.get(part) if isinstance(node, dict) else None
+    if not isinstance(node, dict) or TARGET not in node:
+        return otherwise
+    found = inspect.signature(locate(node[TARGET])).parameters.get(last)
+    return otherwise if found is None or found.default is inspect.Parameter.empty else found.default
 
 
 def build_env(settings: RunSettings, changes: Mapping[str, Any], allowed: Sequence[str] = ()) -> EnvBase:

@@ -8,6 +8,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -235,6 +236,25 @@ class TestResumingTheSameCommand:
         run = make_run("outputs/a/1", "total_frames=1000")
         assert plan_for("resume=auto", *SMALL, "total_frames=2000").folder == run
         assert plan_for("resume=auto", *SMALL, "total_frames=500").folder != run
+
+    @staticmethod
+    def before(run, *settings):
+        """Makes a run one of a version that did not have these settings of its algorithm."""
+        stored = yaml.safe_load((run / "config.yaml").read_text())
+        for name in settings:
+            del stored["algo"][name]
+        (run / "config.yaml").write_text(yaml.safe_dump(stored))
+
+    def test_settings_that_a_run_is_older_than_have_their_defaults(self):
+        run = make_run("outputs/a/1")
+        self.before(run, "levels", "middle", "middle_exploration")
+        assert plan_for("resume=auto", *SMALL).folder == run
+        assert plan_for("resume=auto", *SMALL, "algo.levels=3").folder != run
+
+    def test_a_setting_without_a_default_must_be_there(self):
+        run = make_run("outputs/a/1")
+        self.before(run, "sub")
+        assert plan_for("resume=auto", *SMALL).folder != run
 
     def test_unreadable_runs_are_skipped(self):
         run = make_run("outputs/a/1")

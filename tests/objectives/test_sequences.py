@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from test_recurrent_dqn import ACTIONS, BATCH, NAN, TIME, make_loss, make_sample
 
-from hdrqn_torchrl.objectives.sequences import stored_once
+from hdrqn_torchrl.objectives.sequences import take_apart
 
 INPUTS = ("observation", "subgoal", "subgoal_mask")
 
@@ -137,7 +137,7 @@ def test_a_longer_lookahead_reads_either_form():
 
 def test_the_parts_of_a_sequence():
     sample = once(make_sample())
-    parts = stored_once(
+    parts = take_apart(
         sample,
         sample["collector", "mask"],
         read_keys=["observation"],
@@ -145,6 +145,7 @@ def test_the_parts_of_a_sequence():
         init_key="is_init",
         done_key="done",
         lookahead=2,
+        stored_once=True,
     )
     assert parts.inputs.shape == (BATCH, TIME + 1) and parts.steps.shape == (BATCH, TIME) and parts.lookahead == 1
     assert torch.equal(parts.seen[:, :-1], parts.valid)
