@@ -106,7 +106,7 @@ class TestThreeLevels:
             greedy = self.algorithm.policy(played.select(*self.algorithm.policy.in_keys)[:, 0].clone())
         assert played["rooms_option_init"][:, 0].all()
         far = greedy["subgoal"]
-        allowed = values[1][:, 0].gather(1, far.view(-1, 1, 1).expand(-1, 1, 3)).squeeze(1)
+        allowed = values[1][:, 0].gather(1, far.view(-1, 1, 1).expand(-1, 1, values[1].shape[-1])).squeeze(1)
         allowed = allowed.masked_fill(~played["rooms_subgoal_mask"][:, 0], -torch.inf)
         near = greedy["rooms_subgoal"]
         assert (near == allowed.argmax(-1)).all()
