@@ -18,6 +18,7 @@ from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.learning import LearnerSettings, PhaseOne, phase_monitors
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
+from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.transforms import penalties_of_sets
 
 
@@ -195,6 +196,7 @@ def _check_version(version: str, recurrent: bool, meta_input: str, meta_input_ti
 
 
 def _check_levels(levels: int, meta_hindsight: bool, meta_input_time: str) -> None:
+    check_size("levels", levels, 2)
     if levels < 2:
         raise ValueError(f"levels must be >= 2, got {levels}; use make_drqn for a flat agent.")
     if levels > 2 and meta_hindsight:

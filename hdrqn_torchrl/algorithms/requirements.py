@@ -12,7 +12,9 @@ from torchrl.envs.transforms import TransformedEnv
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms.levels import Level, make_levels
 from hdrqn_torchrl.envs import SubgoalSet, Task, task_of
+from hdrqn_torchrl.envs.specs import check_is_environment
 from hdrqn_torchrl.modules import Architecture
+from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.transforms.entries import Entries, describe
 
 _REMEDIES: tuple[tuple[type[TensorSpec], str], ...] = (
@@ -87,6 +89,9 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
         >>> needs.num_actions, needs.num_subgoals, [level.name for level in needs.levels]
         (4, 2, ['sub', 'meta'])
     """
+    check_is_environment(env)
+    if not isinstance(architecture, Architecture):
+        raise ValueError(f"architecture must be an Architecture, got {architecture!r}; use compact_network().")
     entries, task = Entries.of(env), task_of(env)
     _check_levels(levels, task)
     _check_batch(entries)
@@ -120,10 +125,11 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
 
 def _check_levels(levels: int, task: Task) -> None:
     """Refuses more levels than the task has sets of subgoals for."""
+    check_size("levels", levels, 2)
     most = max(1, len(task.subgoals)) + 1
-    if not 1 <= levels <= most:
+    if levels > most:
         raise ValueError(
-            f"levels must lie in [1, {most}], got {levels}: the task states {len(task.subgoals)} sets of subgoals, and "
+            f"levels must be <= {most}, got {levels}: the task states {len(task.subgoals)} sets of subgoals, and "
             "each level above the first chooses among one of them; use fewer levels, or add sets to Task.subgoals."
         )
 
@@ -143,6 +149,8 @@ def _subgoals(entries: Entries, task: Task, number: int) -> tuple[SubgoalSet, ..
 
 
 def _check_batch(entries: Entries) -> None:
+    if entries.batch_size == (0,):
+        entries.problems.append("the batch size must be [N] with N >= 1, got [0]; use 16 environments")
     if len(entries.batch_size) != 1:
         remedy = (
             "use several environments, for instance SerialEnv(16, make_env)"

@@ -234,7 +234,7 @@ def _make_network(
             has.observation, memory_size, has.num_actions, prediction_steps, width=head_size
         )
     return AllSubgoalsNetwork(
-        architecture.observation_features(has.observation),
+        architecture.features(has.observation),
         num_actions=has.num_actions,
         num_subgoals=[len(each) for each in has.subgoals],
         hidden_size=memory_size,

@@ -16,6 +16,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.findings import Finding, missing, wrong
+from hdrqn_torchrl.envs.specs import check_is_environment
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
 from hdrqn_torchrl.envs.task import Task, task_of
 
@@ -38,13 +39,14 @@ def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding
         What is wrong first, then what is missing; empty if nothing is.
 
     Raises:
-        ValueError: if ``steps`` is below 1.
+        ValueError: if ``env`` is no environment, or ``steps`` is below 1.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
         >>> check_task(MultiGoalGridEnv(4))
         []
     """
+    check_is_environment(env)
     if steps < 1:
         raise ValueError(f"steps must be >= 1, got {steps}; 300 show most faults.")
     task = task_of(env)

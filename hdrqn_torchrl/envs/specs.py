@@ -9,6 +9,19 @@ from torchrl.envs import EnvBase
 from hdrqn_torchrl import keys
 
 
+def check_is_environment(env: EnvBase) -> None:
+    """Refuses what is no TorchRL environment.
+
+    Raises:
+        ValueError: if it is something else.
+    """
+    if not isinstance(env, EnvBase):
+        raise ValueError(
+            f"env must be a TorchRL environment (EnvBase), got {env!r}; make an instance of a class, and wrap an "
+            "environment of Gymnasium: GymWrapper(env, categorical_action_encoding=True)."
+        )
+
+
 def interface(env: EnvBase) -> dict[str, str]:
     """What the networks of an agent are made for: kind and shape of all that it sees and does, of one environment.
 

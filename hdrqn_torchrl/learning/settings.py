@@ -7,6 +7,7 @@ from typing import Literal
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling
 from hdrqn_torchrl.learning.precision import Precision
+from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import check_returns, target_lookahead
 
 
@@ -153,8 +154,13 @@ class LearnerSettings:
         Args:
             total_frames: environment frames of the whole training; ``None``: no change.
 
+        Raises:
+            ValueError: if ``total_frames`` is no whole number from 1 on.
+
         Examples:
             >>> LearnerSettings().lasting(200_000).learning_rate_frames
             200000
         """
+        if total_frames is not None:
+            check_size("total_frames", total_frames, "the frames of the whole training")
         return self if total_frames is None else replace(self, learning_rate_frames=total_frames)

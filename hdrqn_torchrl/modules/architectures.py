@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 
 from hdrqn_torchrl.modules.features import (
@@ -46,6 +47,27 @@ class Architecture:
     def __post_init__(self) -> None:
         check_size("hidden_size", self.hidden_size, "64, or the paper's 256")
 
+    def features(self, inputs: TensorSpec | int) -> Features:
+        """The feature extractor for an observation spec or a vector of a given size, tried once.
+
+        Raises:
+            ValueError: if it is no module with ``out_features``, or returns another number of features.
+        """
+        name = "vector_features" if isinstance(inputs, int) else "observation_features"
+        made = self.vector_features(inputs) if isinstance(inputs, int) else self.observation_features(inputs)
+        if not (isinstance(made, nn.Module) and isinstance(getattr(made, "out_features", None), int)):
+            raise ValueError(f"{name} must make a module with the attribute out_features, got {made!r}; see Features.")
+        example = torch.zeros(1, inputs) if isinstance(inputs, int) else inputs.zero()[:1].cpu()
+        training = made.training
+        with torch.no_grad():
+            found = list(made.eval()(example).shape)
+        if found != [1, made.out_features]:
+            raise ValueError(
+                f"{name} must make a module that returns [*, out_features={made.out_features}], got {found} for an "
+                f"input {list(example.shape)}; set out_features to what it returns, and flatten the rest."
+            )
+        return made.train(training)
+
     def q_network(
         self,
         inputs: TensorSpec | int,
@@ -64,7 +86,7 @@ class Architecture:
         if prediction_steps and not isinstance(inputs, int):
             predictor = observation_predictor(inputs, self.hidden_size, num_actions, prediction_steps)
         return QNetwork(
-            self.vector_features(inputs) if isinstance(inputs, int) else self.observation_features(inputs),
+            self.features(inputs),
             num_actions=num_actions,
             hidden_size=self.hidden_size,
             num_conditions=num_conditions,

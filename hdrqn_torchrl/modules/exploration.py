@@ -189,12 +189,33 @@ def choose(
         ``[*]`` int64.
     """
     carried = None if exploration.carried_spec is None else tensordict.get(carried_key)
-    choice, following = exploration(values, mask=mask, condition=condition, starts=starts, carried=carried)
+    returned = exploration(values, mask=mask, condition=condition, starts=starts, carried=carried)
+    choice, following = _checked(exploration, returned, values.shape[:-1], carried)
     if carried is not None:
         if due is not None:
             following = torch.where(expand_as_right(due, carried), following, carried)
         tensordict.set(unravel_key(("next", carried_key)), following)
     return choice
+
+
+def _checked(
+    exploration: EpsilonGreedy, returned: object, shape: torch.Size, carried: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """What a call returned, after a look at shapes and dtypes: the exploration may be someone's own."""
+    whose = f"{type(exploration).__name__}.forward must return"
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise ValueError(f"{whose} a choice and what to carry, got {type(returned).__name__}; return (choice, None).")
+    _check_tensor(f"{whose} a choice", returned[0], shape, torch.int64, "an index below the number of values")
+    if carried is not None:
+        _check_tensor(f"{whose} what to carry", returned[1], carried.shape, carried.dtype, "as carried_spec has it")
+    return returned
+
+
+def _check_tensor(what: str, value: object, shape: torch.Size, dtype: torch.dtype, remedy: str) -> None:
+    if isinstance(value, Tensor) and value.shape == shape and value.dtype == dtype:
+        return
+    got = f"{list(value.shape)} {value.dtype}" if isinstance(value, Tensor) else repr(value)
+    raise ValueError(f"{what}, {list(shape)} {dtype}, got {got}; {remedy}.")
 
 
 def carried_by(exploration: EpsilonGreedy, key: NestedKey) -> dict[NestedKey, TensorSpec]:

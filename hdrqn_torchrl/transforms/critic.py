@@ -34,7 +34,8 @@ class Critic(Transform):
         attained_key: the entry written; ``None``: ``attained`` with the prefix.
 
     Raises:
-        ValueError: if ``num_subgoals`` is not positive, or there is another number of names.
+        ValueError: if ``num_subgoals`` is not positive, there is another number of names, or, in a step, if the verdict
+            is of another shape or dtype than ``[*, G]`` bool.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -55,8 +56,12 @@ class Critic(Transform):
         repeatable: bool = False,
         attained_key: NestedKey | None = None,
     ) -> None:
-        if num_subgoals < 1:
-            raise ValueError(f"num_subgoals must be >= 1, got {num_subgoals}; give one for each subgoal of the task.")
+        if not isinstance(num_subgoals, int) or num_subgoals < 1:
+            raise ValueError(
+                f"num_subgoals must be a whole number >= 1, got {num_subgoals!r}; count the verdict's columns."
+            )
+        if not callable(verdict):
+            raise ValueError(f"verdict must be a function of what followed a step, got {verdict!r}.")
         if names is not None and len(names) != num_subgoals:
             raise ValueError(f"names must be one for each of {num_subgoals} subgoals, got {len(names)}.")
         self.attained_key = attained_key or keys.OptionKeys(prefix).attained
@@ -66,7 +71,16 @@ class Critic(Transform):
         self.prefix, self.repeatable = prefix, repeatable
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return next_tensordict.set(self.attained_key, self.verdict(next_tensordict))
+        attained = self.verdict(next_tensordict)
+        shape = [*next_tensordict.batch_size, self.num_subgoals]
+        fits = isinstance(attained, Tensor) and list(attained.shape) == shape and attained.dtype == torch.bool
+        if not fits:
+            got = f"{list(attained.shape)} {attained.dtype}" if isinstance(attained, Tensor) else repr(attained)
+            raise ValueError(
+                f"verdict must return which of num_subgoals={self.num_subgoals} subgoals a step attained, {shape} "
+                f"torch.bool, got {got}; compare, and stack along the last dimension."
+            )
+        return next_tensordict.set(self.attained_key, attained)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         shape = (*tensordict_reset.batch_size, self.num_subgoals)

@@ -6,7 +6,7 @@ from helpers import collect, house, tiny_settings
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
-from hdrqn_torchrl.algorithms import Level, make_v3
+from hdrqn_torchrl.algorithms import Level, make_hdrqn, make_v3
 from hdrqn_torchrl.algorithms.levels import make_levels
 from hdrqn_torchrl.envs import MultiGoalGridEnv, SubgoalSet
 from hdrqn_torchrl.learning import PhaseOne
@@ -50,8 +50,14 @@ def test_levels_decides_how_many_levels_learn(levels, names):
 
 def test_more_levels_than_the_task_has_sets_for_are_refused():
     for env, most in ((house(), 3), (MultiGoalGridEnv(4), 2)):
-        with pytest.raises(ValueError, match=rf"levels must lie in \[1, {most}\], got {most + 1}: the task states"):
+        with pytest.raises(ValueError, match=f"levels must be <= {most}, got {most + 1}: the task states"):
             agent(env, most + 1)
+
+
+@pytest.mark.parametrize(("builder", "levels"), [(make_v3, "2"), (make_v3, 0), (make_hdrqn, 2.0), (make_hdrqn, None)])
+def test_a_number_of_levels_that_is_no_whole_number_from_1_on_is_refused(builder, levels):
+    with pytest.raises(ValueError, match=rf"levels must be .*>= 1, got {levels!r}; use 2\."):
+        builder(house(), compact_network(8, (8,)), levels=levels)
 
 
 def test_bonus_reward_is_refused_for_more_than_one_level():

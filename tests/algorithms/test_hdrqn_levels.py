@@ -237,7 +237,7 @@ class TestSettings:
         ("options", "message"),
         [
             ({"levels": 1}, "levels must be >= 2, got 1; use make_drqn"),
-            ({"levels": 4}, r"levels must lie in \[1, 3\], got 4: the task states 2 sets"),
+            ({"levels": 4}, "levels must be <= 3, got 4: the task states 2 sets"),
             ({"meta_hindsight": True}, "meta_hindsight must be False with levels=3, got True"),
             ({"meta_input_time": "after_last_observation"}, "meta_input_time must be 'after_last_decision' with le"),
             ({"wrong_subgoal_reward": [0.0] * 3}, "wrong_subgoal_reward must be one number, or one for each of 2 sets"),

@@ -1,6 +1,7 @@
 """Builders refuse environments that do not fit, with one message that lists every problem."""
 
 import pickle
+import re
 from functools import partial
 
 import gymnasium
@@ -11,7 +12,7 @@ from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOn
 from torchrl.envs import DTypeCastTransform, GymWrapper, ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
 from user_envs import Corridor, Walk
 
-from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.algorithms import make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import make_montezuma
 from hdrqn_torchrl.modules import Architecture, FullyConnectedFeatures, compact_network
 
@@ -38,6 +39,32 @@ def refusal(name, env):
     with pytest.raises(ValueError) as raised:
         build(name, env)
     return str(raised.value)
+
+
+@pytest.mark.parametrize("builder", [make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3])
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((Corridor, PLAIN), "env must be a TorchRL environment (EnvBase), got <class"),
+        ((gymnasium.make("CartPole-v1"), PLAIN), "env must be a TorchRL environment (EnvBase), got <TimeLimit"),
+        ((small_env(N), compact_network), "architecture must be an Architecture, got <function compact_network"),
+        ((small_env(N), torch.nn.Linear(3, 3)), "architecture must be an Architecture, got Linear("),
+    ],
+    ids=["class", "gymnasium", "not called", "module"],
+)
+def test_arguments_of_another_kind_are_refused(builder, given, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        builder(*given)
+
+
+def test_an_environment_without_worlds_is_refused():
+    assert "the batch size must be [N] with N >= 1, got [0]; use 16 environments" in refusal("v2", Corridor(0))
+
+
+@pytest.mark.parametrize("total_frames", [0, "800", 1e5])
+def test_total_frames_that_is_no_whole_number_from_1_on_is_refused(total_frames):
+    with pytest.raises(ValueError, match=rf"total_frames must be .*>= 1, got {total_frames!r}; "):
+        make_v3(small_env(N), compact_network(), total_frames=total_frames)
 
 
 class TestActions:

@@ -4,7 +4,7 @@ from helpers import small_env
 from torch import nn
 from torchrl.data import Bounded
 
-from hdrqn_torchrl.modules import CellsToImage, compact_network, paper_network
+from hdrqn_torchrl.modules import Architecture, CellsToImage, compact_network, paper_network
 from hdrqn_torchrl.modules.architectures import is_grid
 
 IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
@@ -82,3 +82,39 @@ def test_each_network_has_its_own_weights():
 
 def test_is_grid_tells_cell_codes_from_images():
     assert is_grid(small_env().observation_spec["observation"]) and not is_grid(IMAGE)
+
+
+class Summed(nn.Module):
+    """Says that it has eight features, and has twenty-five."""
+
+    out_features = 8
+
+    def forward(self, observation):
+        return observation.flatten(-2).float()
+
+
+@pytest.mark.parametrize(
+    ("made", "message"),
+    [
+        (Summed(), r"returns \[\*, out_features=8\], got \[1, 25\] for an input \[1, 5, 5\]; set out_features to"),
+        (nn.Flatten(), r"must make a module with the attribute out_features, got Flatten\("),
+        (None, "must make a module with the attribute out_features, got None"),
+        (len, "must make a module with the attribute out_features, got <built-in function len>"),
+    ],
+    ids=["another number", "no number", "nothing", "function"],
+)
+def test_a_users_feature_extractor_that_networks_can_not_read_is_refused(made, message):
+    spec = small_env(4, view=5).observation_spec["observation"]
+    architecture = Architecture(hidden_size=8, observation_features=lambda _: made, vector_features=lambda _: made)
+    with pytest.raises(ValueError, match=message):
+        architecture.q_network(spec, num_actions=2)
+
+
+def test_trying_a_feature_extractor_draws_no_random_number_and_leaves_it_in_training():
+    made = nn.Sequential(nn.Flatten(), nn.Dropout(0.5), nn.BatchNorm1d(25))
+    made.out_features = 25
+    before = torch.get_rng_state()
+    spec = Bounded(0, 1, shape=(4, 5, 5), dtype=torch.float32)
+    architecture = Architecture(hidden_size=8, observation_features=lambda _: made, vector_features=lambda _: made)
+    assert architecture.features(spec) is made and made.training
+    assert torch.equal(torch.get_rng_state(), before) and made[2].num_batches_tracked == 0

@@ -183,3 +183,35 @@ def test_an_exploration_of_ones_own_works_at_every_level(builder, level):
     before, after = carried[:, :-1], carried[:, 1:]
     fresh = steps["is_init"][:, 1:].squeeze(-1)
     assert (after == torch.where(fresh, 0, before + due[:, :-1])).all() and carried.max() > 1
+
+
+class Returning(EpsilonGreedy):
+    """Returns what it is told to, whatever it is asked."""
+
+    carried_spec = Unbounded(shape=(1,), dtype=torch.int64)
+
+    def __init__(self, returned):
+        super().__init__()
+        self.returned = returned
+
+    def forward(self, values, *, mask=None, condition=None, starts=None, carried=None):
+        return self.returned
+
+
+CHOICE, KEPT = torch.zeros(3, dtype=torch.int64), torch.zeros(3, 1, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (CHOICE, r"must return a choice and what to carry, got Tensor; return \(choice, None\)"),
+        ((CHOICE.float(), KEPT), r"must return a choice, \[3\] torch.int64, got \[3\] torch.float32; an index"),
+        ((KEPT, KEPT), r"must return a choice, \[3\] torch.int64, got \[3, 1\] torch.int64; an index"),
+        ((CHOICE, None), r"must return what to carry, \[3, 1\] torch.int64, got None; as carried_spec has it"),
+        ((CHOICE, CHOICE), r"must return what to carry, \[3, 1\] torch.int64, got \[3\] torch.int64; as carried_spec"),
+    ],
+    ids=["choice alone", "number", "column", "nothing carried", "carried shape"],
+)
+def test_an_exploration_that_returns_something_else_is_named_with_what_it_must_return(returned, message):
+    with pytest.raises(ValueError, match=f"Returning.forward {message}"):
+        choose(Returning(returned), torch.rand(3, 4), TensorDict({"kept": KEPT}, [3]), "kept")

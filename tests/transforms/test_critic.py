@@ -108,10 +108,40 @@ def test_the_task_has_the_critics_subgoals(settings, sets):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"num_subgoals": 0}, "num_subgoals must be >= 1, got 0; "),
+        ({"num_subgoals": 0}, "num_subgoals must be a whole number >= 1, got 0; "),
         ({"num_subgoals": 2, "names": ("a",)}, "names must be one for each of 2 subgoals, got 1"),
     ],
 )
 def test_wrong_settings_of_a_critic_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         Critic(verdict=mirrored, **settings)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "got"),
+    [
+        (lambda after: after["collected"][:, :1], r"got \[4, 1\] torch.bool"),
+        (lambda after: after["collected"].float(), r"got \[4, 2\] torch.float32"),
+        (lambda after: after["collected"].T, r"got \[2, 4\] torch.bool"),
+        (lambda after: after["collected"].numpy(), r"got array\("),
+        (lambda after: None, "got None"),
+    ],
+    ids=["one column", "numbers", "transposed", "numpy", "nothing"],
+)
+def test_a_verdict_of_another_kind_is_refused_in_its_first_step(verdict, got):
+    env = TransformedEnv(bare_env(), Critic(2, verdict))
+    with pytest.raises(ValueError, match=rf"verdict must return .*num_subgoals=2 .*\[4, 2\] torch.bool, {got}"):
+        env.rollout(2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("2", mirrored), "num_subgoals must be a whole number >= 1, got '2'"),
+        ((0, mirrored), "num_subgoals must be a whole number >= 1, got 0"),
+        ((2, "mirrored"), "verdict must be a function of what followed a step, got 'mirrored'"),
+    ],
+)
+def test_a_critic_without_columns_or_function_is_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Critic(*arguments)
