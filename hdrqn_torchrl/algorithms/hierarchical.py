@@ -72,7 +72,7 @@ def make_hdrqn(
         sub_exploration, meta_exploration, middle_exploration: their schedules; ``None``: those of
             :mod:`~hdrqn_torchrl.algorithms.presets`, and for middle levels the meta level's. Each middle level has a
             copy of its own.
-        phase_one: how long the meta level's subgoals are chosen at random and it does not learn; ``None``: all levels
+        phase_one: how long the levels above the sub level choose at random and do not learn; ``None``: all levels
             learn from the start.
         gamma: discount of one step.
         smdp_discount: discount the option's return inside the option and what follows by :math:`\gamma^k`;
@@ -169,7 +169,7 @@ def make_hdrqn(
         task=has.task,
         make_transforms=copies_of(InitTracker(), *books, *primers),
         levels=views_of(has.levels, masked=[each.mask_key is not None for each in uppers]),
-        monitors=phase_monitors(phase_one, has.num_subgoals, meta_exploration, learners[-1]),
+        monitors=phase_monitors(phase_one, has.subgoals, explorations[1:], learners[1:]),
     )
 
 

@@ -194,7 +194,7 @@ def make_v3(
         task=has.task,
         make_transforms=copies_of(InitTracker(), *books, policy.make_tensordict_primer()),
         levels=views_of(has.levels),
-        monitors=phase_monitors(phase_one, has.num_subgoals, meta_exploration, None),
+        monitors=phase_monitors(phase_one, has.subgoals, explorations[1:]),
     )
 
 

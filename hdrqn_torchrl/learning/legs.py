@@ -9,13 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from hdrqn_torchrl import keys
-
-_READ = (
-    keys.IS_INIT,
-    keys.OPTION_INIT,
-    keys.ATTAINED,
-    *(("next", key) for key in (keys.ATTAINED, keys.ACTIVE_SUBGOAL, keys.OPTION_DONE, keys.SUBGOAL_REACHED)),
-)
+from hdrqn_torchrl.keys import OptionKeys
 
 
 class LegCounter:
@@ -28,6 +22,7 @@ class LegCounter:
 
     Args:
         num_subgoals: G.
+        names: entries of the set of subgoals; its prefix is that of the columns, too.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -41,8 +36,10 @@ class LegCounter:
         ([[0, 0], [0, 0], [0, 1]], [[0, 0], [0, 0], [0, 1]])
     """
 
-    def __init__(self, num_subgoals: int) -> None:
-        self.num_subgoals = num_subgoals
+    def __init__(self, num_subgoals: int, *, names: OptionKeys = OptionKeys()) -> None:  # noqa: B008 (frozen)
+        self.num_subgoals, self.names = num_subgoals, names
+        after = (names.attained, names.active_subgoal, names.option_done, names.subgoal_reached)
+        self._read = keys.IS_INIT, names.option_init, names.attained, *(("next", key) for key in after)
         self.options = torch.zeros(num_subgoals + 1, num_subgoals, dtype=torch.int64)
         """``[G + 1, G]``: options that have ended."""
         self.reached = torch.zeros_like(self.options)
@@ -52,7 +49,7 @@ class LegCounter:
 
     def observe(self, batch: TensorDictBase) -> None:
         """Takes a collected batch ``[N, T]``."""
-        for step in batch.select(*_READ).cpu().unbind(1):
+        for step in batch.select(*self._read).cpu().unbind(1):
             self.add_step(step)
 
     def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
@@ -62,18 +59,18 @@ class LegCounter:
             step: of all environments.
             counted: in which of them options that end count, ``[N]`` bool; ``None``: in all.
         """
-        step = step.select(*_READ).cpu()
-        start, after = torch.tensor(self.num_subgoals), step.get("next")
+        step = step.select(*self._read).cpu()
+        start, after, names = torch.tensor(self.num_subgoals), step.get("next"), self.names
         if self._place is None or self._origin is None:
             self._place = self._origin = start.expand(step.batch_size)
-        fresh = torch.where(step[keys.ATTAINED].any(-1), step[keys.ATTAINED].int().argmax(-1), start)
+        fresh = torch.where(step[names.attained].any(-1), step[names.attained].int().argmax(-1), start)
         place = torch.where(step[keys.IS_INIT].squeeze(-1), fresh, self._place)
-        self._origin = torch.where(step[keys.OPTION_INIT].squeeze(-1), place, self._origin)
-        leg = self._origin * self.num_subgoals + after[keys.ACTIVE_SUBGOAL]
-        for counts, happened in ((self.options, keys.OPTION_DONE), (self.reached, keys.SUBGOAL_REACHED)):
+        self._origin = torch.where(step[names.option_init].squeeze(-1), place, self._origin)
+        leg = self._origin * self.num_subgoals + after[names.active_subgoal]
+        for counts, happened in ((self.options, names.option_done), (self.reached, names.subgoal_reached)):
             now = after[happened].squeeze(-1)
             counts.view(-1).index_add_(0, leg, (now if counted is None else now & counted).long())
-        attained = after[keys.ATTAINED]
+        attained = after[names.attained]
         self._place = torch.where(attained.any(-1), attained.int().argmax(-1), place)
 
     @property
@@ -85,7 +82,7 @@ class LegCounter:
         """:attr:`rates` by name, such as ``legs/start_to_0``."""
         names = [*range(self.num_subgoals), "start"]
         return {
-            f"legs/{origin}_to_{target}": rate
+            f"{self.names.of('legs')}/{origin}_to_{target}": rate
             for origin, row in zip(names, self.rates.tolist(), strict=True)
             for target, rate in enumerate(row)
         }

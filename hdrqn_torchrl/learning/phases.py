@@ -1,13 +1,16 @@
-"""Two phases of training (section IV-D): first the sub level alone, then both."""
+"""Two phases of training (section IV-D): first the sub level alone, then all levels."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 
+from hdrqn_torchrl.envs import SubgoalSet
+from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.learning.learner import Learner
 from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
@@ -41,32 +44,46 @@ class PhaseOne:
 
 
 class Phases:
-    """Holds the meta level while the first phase lasts: it chooses subgoals at random and does not learn. (A monitor.)
+    """Holds the upper levels while the first phase lasts: they choose at random and do not learn. (A monitor.)
 
     Args:
         settings: how long that is.
-        num_subgoals: G.
-        exploration: the meta level's; it must start at epsilon 1 to choose at random.
-        learner: the meta level's, if it has one of its own.
+        num_subgoals: G, of the set that the sub level pursues.
+        explorations: the upper levels'; they must start at epsilon 1 to choose at random. The meta level's is the last.
+        learners: the upper levels', where they have their own.
+        names: entries of the set that the sub level pursues.
 
     Raises:
-        ValueError: if the meta level would not choose at random.
+        ValueError: if an upper level would not choose at random.
     """
 
     def __init__(
-        self, settings: PhaseOne, num_subgoals: int, exploration: EpsilonGreedy, learner: Learner | None
+        self,
+        settings: PhaseOne,
+        num_subgoals: int,
+        explorations: Sequence[EpsilonGreedy],
+        learners: Sequence[Learner],
+        *,
+        names: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
     ) -> None:
-        if exploration.start != 1.0:
-            raise ValueError(f"meta_exploration.start must be 1.0 with phase_one, got {exploration.start}.")
-        self.settings, self.exploration, self.learner = settings, exploration, learner
-        self.success = SubgoalSuccess(num_subgoals, window=settings.window).to(exploration.epsilon.device)
+        for name, each in zip([*["middle"] * (len(explorations) - 1), "meta"], explorations, strict=True):
+            if each.start != 1.0:
+                raise ValueError(f"{name}_exploration.start must be 1.0 with phase_one, got {each.start}.")
+        self.settings, self.explorations, self.learners = settings, explorations, learners
+        self.success = SubgoalSuccess(
+            num_subgoals,
+            window=settings.window,
+            active_subgoal_key=names.active_subgoal,
+            option_done_key=names.option_done,
+            reached_key=names.subgoal_reached,
+        ).to(explorations[-1].epsilon.device)
         self.frames = 0
         self._hold(True)
 
     @property
     def phase(self) -> int:
         """1 or 2."""
-        return 1 if self.exploration.held else 2
+        return 1 if self.explorations[-1].held else 2
 
     def observe(self, batch: TensorDictBase) -> None:
         """Counts a collected batch ``[N, T]``, and begins the second phase when it is time."""
@@ -87,9 +104,10 @@ class Phases:
         """Nothing starts again with a row."""
 
     def _hold(self, held: bool) -> None:
-        self.exploration.held = held
-        if self.learner is not None:
-            self.learner.held = held
+        for exploration in self.explorations:
+            exploration.held = held
+        for learner in self.learners:
+            learner.held = held
 
     def state_dict(self) -> dict[str, Any]:
         """What it has counted, and which phase it is."""
@@ -107,18 +125,28 @@ class Phases:
 
 
 def phase_monitors(
-    settings: PhaseOne | None, num_subgoals: int, exploration: EpsilonGreedy, learner: Learner | None
+    settings: PhaseOne | None,
+    subgoals: Sequence[SubgoalSet],
+    explorations: Sequence[EpsilonGreedy],
+    learners: Sequence[Learner] = (),
 ) -> dict[str, Monitor]:
-    """The monitors of a training in two phases; none if ``settings`` is ``None``.
+    """What a training in two phases is watched by; nothing if ``settings`` is ``None``.
 
     Args:
-        settings, num_subgoals, exploration, learner: as in :class:`Phases`.
+        settings: how long the sub level learns alone.
+        subgoals: the sets that are pursued, from near to far; legs are counted for each.
+        explorations, learners: as in :class:`Phases`.
 
     Examples:
-        >>> list(phase_monitors(PhaseOne(), 2, EpsilonGreedy(), None))
-        ['phases', 'legs', 'visits']
+        >>> sets = [SubgoalSet(names=("door",), prefix="doors"), SubgoalSet(names=("key", "goal"))]
+        >>> list(phase_monitors(PhaseOne(), sets, [EpsilonGreedy(), EpsilonGreedy()]))
+        ['phases', 'doors_legs', 'legs', 'visits']
     """
     if settings is None:
         return {}
-    phases = Phases(settings, num_subgoals, exploration, learner)
-    return {"phases": phases, "legs": LegCounter(num_subgoals), "visits": VisitCounter()}
+    near = subgoals[0]
+    return {
+        "phases": Phases(settings, len(near), explorations, learners, names=near.keys),
+        **{each.keys.of("legs"): LegCounter(len(each), names=each.keys) for each in subgoals},
+        "visits": VisitCounter(),
+    }

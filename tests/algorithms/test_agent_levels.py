@@ -142,3 +142,20 @@ class TestThreeLevels:
 def test_a_flat_agent_has_no_first_phase():
     with pytest.raises(ValueError, match=r"phase_one must be None with levels=1"):
         agent(house(), 1, phase_one=PhaseOne())
+
+
+def test_all_levels_above_the_sub_level_wait_in_the_first_phase():
+    random = EpsilonGreedy(1.0, 0.1)
+    waiting = agent(house(), 3, phase_one=PhaseOne(), meta_exploration=random)
+    assert [each.held for each in waiting.explorations.values()] == [False, True, True]
+    assert list(waiting.monitors) == ["phases", "rooms_legs", "legs", "visits"]
+    near, far = (len(each) for each in waiting.task.subgoals)
+    assert sum(name.startswith("phase/success_") for name in waiting.monitors["phases"].metrics()) == near
+    for name, size in (("rooms_legs", near), ("legs", far)):
+        columns = waiting.monitors[name].metrics()
+        assert len(columns) == (size + 1) * size and f"{name}/start_to_0" in columns
+
+
+def test_their_learners_wait_as_well():
+    waiting = make_hdrqn(house(), compact_network(8, (8,)), levels=3, phase_one=PhaseOne(max_frames=1))
+    assert [each.held for each in waiting.learners.values()] == [False, True, True]

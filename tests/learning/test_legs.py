@@ -4,6 +4,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.learning.legs import LegCounter
 
 
@@ -76,3 +77,14 @@ def test_columns_of_legs_are_shares_and_a_new_row_counts_from_zero():
     assert list(metrics.values()) == pytest.approx(legs.rates.flatten().tolist(), nan_ok=True)
     legs.clear()
     assert all(math.isnan(share) for share in legs.metrics().values())
+
+
+def test_each_set_of_subgoals_has_entries_and_columns_of_its_own():
+    yes, subgoal = torch.ones(1, 1, 1, dtype=torch.bool), torch.tensor([[1]])
+    attained = torch.tensor([[[False, True]]])
+    step = {f"rooms_{name}": yes for name in ("option_done", "subgoal_reached")}
+    after = {"rooms_attained": attained, "rooms_active_subgoal": subgoal, **step}
+    root = {"is_init": yes, "rooms_option_init": yes, "rooms_attained": ~(attained | yes), "next": after}
+    legs = LegCounter(2, names=OptionKeys("rooms"))
+    legs.observe(TensorDict(root, [1, 1]))
+    assert legs.metrics()["rooms_legs/start_to_1"] == 1.0

@@ -26,7 +26,7 @@ def options(*reached):
 class TestPhases:
     def make(self, **settings):
         exploration = EpsilonGreedy(1.0, 0.1, anneal_frames=10)
-        return Phases(PhaseOne(**settings), 2, exploration, None), exploration
+        return Phases(PhaseOne(**settings), 2, [exploration], []), exploration
 
     def test_the_first_phase_ends_when_every_subgoal_is_reached_often_enough(self):
         phases, _ = self.make(success=0.75, min_options=4)
@@ -71,7 +71,7 @@ class TestPhases:
 
     def test_the_meta_level_must_choose_at_random(self):
         with pytest.raises(ValueError, match=r"meta_exploration\.start must be 1\.0 with phase_one, got 0\.5"):
-            Phases(PhaseOne(), 2, EpsilonGreedy(0.5), None)
+            Phases(PhaseOne(), 2, [EpsilonGreedy(0.5)], [])
 
     @pytest.mark.parametrize("settings", [{"success": 0.0}, {"success": 1.1}, {"max_frames": 0}], ids=str)
     def test_settings_out_of_range_are_refused(self, settings):
