@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 import sys
@@ -12,12 +13,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import collect, tiny_settings
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep
 from run_folders import write_run
 
+from hdrqn_torchrl.algorithms import make_v3
 from hdrqn_torchrl.cli.check import composed
 from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.envs import check_task
+from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.commands import PROGRAMS
 
@@ -104,6 +109,17 @@ def test_python_blocks_run_one_after_the_other(page, tmp_path, monkeypatch):
             code = code.replace(shown, run)
         torch.manual_seed(0)
         exec(compile(code, f"{page.name}, block {number}", "exec"), names)
+
+
+def test_the_environment_of_the_page_on_tasks_keeps_the_contract_and_is_learned_from():
+    names: dict = {}
+    exec(next(code for code in python_blocks(ROOT / "docs/own_tasks.md") if "class Corridor" in code), names)
+    env = names["Corridor"](4, seed=0)
+    assert not [finding for finding in check_task(env) if finding.severity == "wrong"]
+    agent = make_v3(env, compact_network(8, (8,)), learner=tiny_settings(sampling="episode_starts", slice_len=30))
+    for batch in collect(agent, env, 40, batches=2):
+        agent.observe(batch)
+    assert all(math.isfinite(value) for value in agent.learners["joint"].learn().values())
 
 
 @pages

@@ -36,7 +36,7 @@ def main() -> None:
         return
     try:
         found = check_settings(composed(arguments))
-    except SettingsError as error:
+    except ValueError as error:  # also of the environment's own parts, such as a critic
         sys.exit(f"error: {error}")
     print("\n".join(found) or "nothing is wrong or missing")
     sys.exit(any(line.startswith("wrong") for line in found))

@@ -1,8 +1,11 @@
 """check.py: the contract for tasks on the command line."""
 
 import pytest
+from helpers import small_env
+from torchrl.envs import TransformedEnv
 
 from hdrqn_torchrl.cli import check
+from hdrqn_torchrl.transforms import Critic
 
 
 @pytest.fixture
@@ -34,6 +37,12 @@ def test_an_environment_of_a_users_configuration_folder_is_checked_wherever_the_
 def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
     monkeypatch.setattr(check, "check_settings", lambda settings: ["wrong: 'reward' is missing (no agent)"])
     assert run("env=gridworld") == (1, "wrong: 'reward' is missing (no agent)\n")
+
+
+def test_an_error_of_a_part_of_the_environment_is_told_without_a_traceback(run, monkeypatch):
+    monkeypatch.setattr("hdrqn_torchrl.cli.check.build_env", lambda *_: TransformedEnv(small_env(4), Critic(2, len)))
+    code, _ = run("env=gridworld")
+    assert code.startswith("error: verdict must return which of num_subgoals=2 subgoals a step attained, [4, 2]")
 
 
 @pytest.mark.parametrize(
