@@ -137,7 +137,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
         "env": agent.config.env,
         "seed": seed,
         "epsilon": settings.epsilon,
-        **summarise(played),
+        **summarise(played, names=task.subgoals[-1].names if task.subgoals else ()),
         **({"legs": legs_of(observers["legs"])} if "legs" in observers else {}),
         "ceiling": ceiling_of(references, task),
         "references": references,

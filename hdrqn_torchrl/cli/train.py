@@ -30,6 +30,7 @@ from hdrqn_torchrl.runs.settings import check, pick_device
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
+    from hdrqn_torchrl.algorithms import Algorithm
     from hdrqn_torchrl.runs.references import Players
     from hdrqn_torchrl.runs.trainer import Trainer
 
@@ -112,6 +113,16 @@ def in_words(run: Plan) -> Iterator[None]:
 def tell(sentence: str) -> None:
     """Announces slow work on the terminal."""
     print(sentence, file=sys.stderr, flush=True)
+
+
+def never_updated(algorithm: Algorithm, total_frames: int) -> list[str]:
+    """A warning for each learner whose first update would come after the end of the training."""
+    return [
+        f"warning: total_frames={total_frames:,} must be above warmup_frames={learner.settings.warmup_frames:,} for "
+        f"the learner {name!r} to learn anything; use more frames or a shorter warmup"
+        for name, learner in algorithm.learners.items()
+        if total_frames <= learner.settings.warmup_frames
+    ]
 
 
 def tell_of_player(sentence: str) -> None:
@@ -215,6 +226,8 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
             f"evaluation.env must not change what the agent sees or does, got "
             f"{config.evaluation.env}: {found}; set env.KEY for both."
         )
+    for sentence in never_updated(algorithm, config.total_frames):
+        tell(sentence)
     evaluation_env = algorithm.transform(evaluation_base)
     chosen = config.evaluation
     players = Players(

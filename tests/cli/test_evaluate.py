@@ -44,7 +44,8 @@ def test_the_printed_result_holds_means_intervals_and_the_ceiling(call):
     for name, interval in result["intervals"].items():
         assert interval is None or interval[0] <= result[name] <= interval[1], name
     assert result["intervals"]["success_rate"] and result["intervals"]["intrinsic_mean"]
-    assert len(result["per_subgoal"]) == 2 and all(0 <= each["attained"] <= 1 for each in result["per_subgoal"])
+    assert [each["name"] for each in result["per_subgoal"]] == ["goal 1", "goal 2"]
+    assert all(0 <= each["attained"] <= 1 for each in result["per_subgoal"])
     assert result["references"]["memory"]["return_mean"] == result["ceiling"]
 
 

@@ -13,7 +13,7 @@ from functools import cache, partial
 
 import pytest
 import torch
-from helpers import check_same_checkpoint, make_collector, table
+from helpers import check_same_checkpoint, make_collector, small_env, table
 from hydra import compose, initialize_config_dir
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf
@@ -21,9 +21,11 @@ from processes import leftovers, limit_file_size, limited_file_size, run_script,
 from programs import CONF, ROOT, TINY, TINY_HDRQN, call
 from safetensors.torch import load_file
 
+from hdrqn_torchrl.algorithms import make_hdrqn
 from hdrqn_torchrl.cli import train
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.learning import Learner
+from hdrqn_torchrl.learning import Learner, LearnerSettings
+from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.building import build, build_algorithm
 from hdrqn_torchrl.runs.durable import verify
 from hdrqn_torchrl.runs.folder import locked
@@ -167,6 +169,15 @@ class TestMessages:
     )
     def test_an_unknown_name_is_named(self, run, argument, part):
         assert part in run(argument)
+
+
+def test_a_training_that_ends_before_a_learner_begins_is_warned_of():
+    agent = make_hdrqn(small_env(), compact_network(8, (8,)), meta=LearnerSettings(warmup_frames=9_000))
+    assert train.never_updated(agent, 9_001) == []
+    assert train.never_updated(agent, 9_000) == [
+        "warning: total_frames=9,000 must be above warmup_frames=9,000 for the learner 'meta' to learn anything; use "
+        "more frames or a shorter warmup"
+    ]
 
 
 @pytest.mark.parametrize("question", [["--help"], ["--cfg", "job"], ["--cfg", "job", "algo=drqn"]], ids=" ".join)
