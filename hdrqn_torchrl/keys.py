@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 # Written by the environment.
-OBSERVATION = "observation"  # [V, V] uint8 cell codes, or [3, 44, 44] uint8 pixels: o_t
+OBSERVATION = "observation"  # cell codes [V, V] or others, pixels [C, height, width] uint8, or a vector [D]: o_t
 REWARD = "reward"  # [1] float32: total reward of the task
 EXTRINSIC_REWARD = "extrinsic_reward"  # [1] float32: r^ex
 ATTAINED = "attained"  # [G] bool: subgoals reached in this step, whichever was chosen
 AVAILABLE = "available"  # [G] bool: subgoals worth choosing now; optional
+ACTION_MASK = "action_mask"  # [A] bool: actions that can be chosen now; optional
 HAZARD = "hazard"  # [1] bool: obstacle hit or life lost in this step
 SUCCESS = "success"  # [1] bool: the whole task was completed in this step
 IS_INIT = "is_init"  # [1] bool: first step of an episode

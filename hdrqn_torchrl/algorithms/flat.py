@@ -57,13 +57,19 @@ def make_drqn(
     network = architecture.q_network(
         has.observation, num_actions=has.num_actions, recurrent=recurrent, prediction_steps=prediction_steps
     )
-    policy = SubController(network, exploration, subgoal_key=None, init_key=keys.IS_INIT).to(env.device)
+    policy = SubController(
+        network, exploration, subgoal_key=None, init_key=keys.IS_INIT, mask_key=has.action_mask_key
+    ).to(env.device)
     with settings_named("learner"):
         flat = Learner(
             policy,
             learner,
             extract=StepSelector(
-                root_keys=[keys.OBSERVATION, keys.ACTION, keys.IS_INIT, *stored_states(policy, learner)],
+                root_keys=[
+                    *(keys.OBSERVATION, keys.ACTION, keys.IS_INIT),
+                    *has.action_mask_keys,
+                    *stored_states(policy, learner),
+                ],
                 next_keys=[keys.REWARD],
             ),
             loss=make_recurrent_loss(
@@ -71,6 +77,7 @@ def make_drqn(
                 learner,
                 gamma=gamma,
                 largest_return=has.task.largest_return,
+                loss_keys={"action_mask": has.action_mask_key},
                 prediction_weight=prediction_weight,
             ),
             num_envs=has.num_envs,
@@ -81,7 +88,7 @@ def make_drqn(
         learners={"flat": flat},
         explorations={"flat": exploration},
         task=has.task,
-        levels=views_of(has.levels),
+        levels=views_of(has.levels, action_mask_key=has.action_mask_key),
         make_transforms=copies_of(InitTracker(), policy.make_tensordict_primer()),
     )
 

@@ -72,7 +72,8 @@ class LevelBuilder:
             recurrent=self.recurrent,
             prediction_steps=self.prediction_steps,
         )
-        return SubController(network, exploration, subgoal_key=pursued.subgoal, init_key=pursued.option_init)
+        subgoal_key, init_key, mask_key = pursued.subgoal, pursued.option_init, self.has.action_mask_key
+        return SubController(network, exploration, subgoal_key=subgoal_key, init_key=init_key, mask_key=mask_key)
 
     def upper_controller(self, index: int, exploration: EpsilonGreedy) -> MetaController:
         """The controller of a level that chooses subgoals, ``index`` >= 1."""
@@ -117,6 +118,7 @@ class LevelBuilder:
                     root_keys=[
                         *(keys.OBSERVATION, keys.ACTION, pursued.option_init),
                         *starts,
+                        *has.action_mask_keys,
                         *stored_states(controller, settings),
                         *([pursued.subgoal_mask] if hindsight else []),
                     ],
@@ -132,6 +134,7 @@ class LevelBuilder:
                     loss_keys={
                         **_ends(pursued),
                         "init": pursued.option_init,
+                        "action_mask": has.action_mask_key,
                         "eligible": keys.ELIGIBLE if hindsight else None,
                     },
                     prediction_weight=self.prediction_weight,

@@ -60,8 +60,8 @@ def make_hdrqn(
 
     Args:
         env: bare environment with batch size ``[N]``; of :mod:`hdrqn_torchrl.keys` it needs ``observation``,
-            ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available`` and ``success`` are
-            used where they are.
+            ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available``, ``action_mask``
+            and ``success`` are used where they are.
         architecture: networks.
         version: what levels that choose subgoals read: ``"v1"`` the observation, ``"v2"`` the state of the level below.
         levels: L; the agent pursues the farthest L - 1 sets of subgoals of the task.
@@ -168,7 +168,11 @@ def make_hdrqn(
         explorations=dict(zip(names, explorations, strict=True)),
         task=has.task,
         make_transforms=copies_of(InitTracker(), *books, *primers),
-        levels=views_of(has.levels, masked=[each.mask_key is not None for each in uppers]),
+        levels=views_of(
+            has.levels,
+            action_mask_key=has.action_mask_key,
+            masked=[each.mask_key is not None for each in uppers],
+        ),
         monitors=phase_monitors(phase_one, has.subgoals, explorations[1:], learners[1:]),
     )
 

@@ -36,6 +36,7 @@ class Requirements:
         num_actions: number of actions.
         subgoals: the sets of subgoals that the agent pursues, from near to far; empty for a flat agent.
         available_keys: for each set, the entry that marks the subgoals worth choosing, or ``None``.
+        action_mask_key: the entry that marks the actions that can be chosen, or ``None``.
         hazard_key: the entry that marks the hazard; ``None`` if the environment or the agent has none.
         task: what the environment states about itself.
     """
@@ -45,6 +46,7 @@ class Requirements:
     num_actions: int
     subgoals: tuple[SubgoalSet, ...]
     available_keys: tuple[NestedKey | None, ...]
+    action_mask_key: NestedKey | None
     hazard_key: NestedKey | None
     task: Task
 
@@ -62,6 +64,11 @@ class Requirements:
     def levels(self) -> tuple[Level, ...]:
         """The agent's levels, from level 0 up."""
         return make_levels(self.num_actions, self.subgoals)
+
+    @property
+    def action_mask_keys(self) -> list[NestedKey]:
+        """The action mask's entry, if there is one."""
+        return [] if self.action_mask_key is None else [self.action_mask_key]
 
     @property
     def hazard_keys(self) -> list[NestedKey]:
@@ -111,6 +118,8 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
     for key in (keys.HAZARD, keys.SUCCESS):
         if key in entries and (levels > 1 or key == keys.SUCCESS):
             entries.require_flags(key)
+    if keys.ACTION_MASK in entries:
+        entries.require_flags(keys.ACTION_MASK, getattr(entries.specs.get(keys.ACTION), "n", None))
     entries.check(builder)
     return Requirements(
         num_envs=env.batch_size[0],
@@ -118,6 +127,7 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
         num_actions=entries.specs[keys.ACTION].n,
         subgoals=subgoals,
         available_keys=available,
+        action_mask_key=keys.ACTION_MASK if keys.ACTION_MASK in entries else None,
         hazard_key=keys.HAZARD if levels > 1 and keys.HAZARD in entries else None,
         task=task,
     )
@@ -178,7 +188,14 @@ def _check_resets(env: EnvBase, entries: Entries) -> None:
 def _check_observation(entries: Entries, architecture: Architecture) -> None:
     spec = entries.specs.get(keys.OBSERVATION)
     if spec is None:
-        entries.problems.append(f"{keys.OBSERVATION!r} must be what the agent sees, it is missing")
+        nested = [key[1:] for key in entries.specs if isinstance(key, tuple) and key[0] == keys.OBSERVATION]
+        remedy = (
+            f"it is made of several, {sorted('.'.join(key) for key in nested)}: join them, for instance with "
+            "CatTensors, or make the environment with make_gym"
+        )
+        entries.problems.append(
+            f"{keys.OBSERVATION!r} must be what the agent sees, {remedy if nested else 'it is missing'}"
+        )
         return
     problem = architecture.observation_problem(spec, spec.shape[len(entries.batch_size) :])
     if problem is not None:

@@ -77,8 +77,8 @@ def make_v3(
 
     Args:
         env: bare environment with batch size ``[N]``; of the entries in :mod:`hdrqn_torchrl.keys` it needs
-            ``observation``, ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available``
-            and ``success`` are used if present.
+            ``observation``, ``action``, ``reward``, ``extrinsic_reward`` and ``attained``; ``hazard``, ``available``,
+            ``action_mask`` and ``success`` are used if present.
         architecture: provides the feature extractor.
         levels: number of levels. The agent pursues the last ``levels - 1`` sets of subgoals that the task states
             (:class:`~hdrqn_torchrl.envs.Task`). 1: a flat agent with the same memory and loss, which learns from the
@@ -143,6 +143,7 @@ def make_v3(
         meta_exploration if levels > 1 else None,
         middle_explorations=[deepcopy(middle_exploration or meta_exploration) for _ in has.subgoals[:-1]],
         subgoal_keys=[each.keys for each in has.subgoals],
+        action_mask_key=has.action_mask_key,
     ).to(env.device)
     flat = levels == 1
     loss = AllSubgoalsLoss(
@@ -193,7 +194,7 @@ def make_v3(
         explorations={level.name: each for level, each in zip(has.levels, explorations, strict=True)},
         task=has.task,
         make_transforms=copies_of(InitTracker(), *books, policy.make_tensordict_primer()),
-        levels=views_of(has.levels),
+        levels=views_of(has.levels, action_mask_key=has.action_mask_key),
         monitors=phase_monitors(phase_one, has.subgoals, explorations[1:]),
     )
 

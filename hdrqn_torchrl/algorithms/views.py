@@ -37,11 +37,14 @@ class LevelView:
     choice_names: tuple[str, ...] = ()
 
 
-def views_of(levels: Sequence[Level], *, masked: Sequence[bool] | None = None) -> tuple[LevelView, ...]:
+def views_of(
+    levels: Sequence[Level], *, action_mask_key: NestedKey | None = None, masked: Sequence[bool] | None = None
+) -> tuple[LevelView, ...]:
     """The usual entries of an agent's levels.
 
     Args:
         levels: from level 0 up.
+        action_mask_key: the entry that tells which actions can be chosen; ``None``: all.
         masked: whether subgoals that can't be chosen are left out, for each level that chooses some; ``None``: yes.
 
     Examples:
@@ -51,14 +54,24 @@ def views_of(levels: Sequence[Level], *, masked: Sequence[bool] | None = None) -
         >>> [view.value_key for view in views_of(make_levels(4, [rooms, goals]))]
         ['action_value', 'rooms_subgoal_value', 'subgoal_value']
     """
-    chosen = [False, *([True] * (len(levels) - 1) if masked is None else masked)]
-    return tuple(_view(level, left_out) for level, left_out in zip(levels, chosen, strict=True))
+    uppers = levels[1:]
+    masks = [True] * len(uppers) if masked is None else masked
+    subgoal_views = (_view_of_subgoals(level, is_masked) for level, is_masked in zip(uppers, masks, strict=True))
+    return (_view_of_actions(levels[0], action_mask_key), *subgoal_views)
 
 
-def _view(level: Level, masked: bool) -> LevelView:
-    reward_key = None if level.pursues is None else level.pursues.keys.intrinsic_reward
-    if level.choices is None:
-        return LevelView(name=level.name, choice_key=keys.ACTION, value_key=keys.ACTION_VALUE, reward_key=reward_key)
+def _view_of_actions(level: Level, mask_key: NestedKey | None) -> LevelView:
+    return LevelView(
+        name=level.name,
+        choice_key=keys.ACTION,
+        value_key=keys.ACTION_VALUE,
+        mask_key=mask_key,
+        reward_key=_reward_key(level),
+    )
+
+
+def _view_of_subgoals(level: Level, masked: bool) -> LevelView:
+    assert level.choices is not None
     names = level.choices.keys
     return LevelView(
         name=level.name,
@@ -67,6 +80,10 @@ def _view(level: Level, masked: bool) -> LevelView:
         mask_key=names.subgoal_mask if masked else None,
         init_key=names.option_init,
         reached_key=names.subgoal_reached,
-        reward_key=reward_key,
+        reward_key=_reward_key(level),
         choice_names=level.choices.names,
     )
+
+
+def _reward_key(level: Level) -> NestedKey | None:
+    return None if level.pursues is None else level.pursues.keys.intrinsic_reward

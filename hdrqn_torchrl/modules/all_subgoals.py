@@ -43,6 +43,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         action_key, action_value_key: entries that are written.
         hidden_key, cell_key: LSTM state ``[H]``.
         exploration_key: state that the exploration of actions carries, if any.
+        action_mask_key: actions that can be chosen ``[A]`` bool; ``None``: all of them.
 
     Raises:
         ValueError: if an exploration is not an ``EpsilonGreedy``, serves two levels or can't choose subgoals, or if
@@ -76,6 +77,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         hidden_key: NestedKey = keys.MEMORY_HIDDEN,
         cell_key: NestedKey = keys.MEMORY_CELL,
         exploration_key: NestedKey = keys.ACTION_EXPLORATION,
+        action_mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
         if len(subgoal_keys) != len(network.num_subgoals):
@@ -100,12 +102,14 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         """Whether acting also writes the Q-values that choices were made by, for watching."""
         self.state_keys: list[NestedKey] = [hidden_key, cell_key]
         self.mask_keys = [each.subgoal_mask for each in subgoal_keys]
+        self.action_mask_key = action_mask_key
         self._carried = carried_by(self.sub_exploration, exploration_key)
         for exploration, each in zip(self.subgoal_explorations, subgoal_keys, strict=True):
             self._carried |= carried_by(exploration, each.exploration)
         carried = [*self.state_keys, previous_action_key, *self._carried]
         books = [key for each in subgoal_keys for key in (each.option_init, each.active_subgoal, each.subgoal_mask)]
-        self.in_keys = [observation_key, init_key, *books, *carried]
+        masks = [] if action_mask_key is None else [action_mask_key]
+        self.in_keys = [observation_key, init_key, *masks, *books, *carried]
         self.out_keys = [*(each.subgoal for each in subgoal_keys), action_key, *(_next(key) for key in carried)]
 
     def _check_explorations(self) -> None:
@@ -153,7 +157,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         subgoal, starts = self._choose_subgoals(values[1:], masks, tensordict)
         wanted = values[0].squeeze(-2) if subgoal is None else values_of(values[0], subgoal)
         sub, key = self.sub_exploration, self.exploration_key
-        action = choose(sub, wanted, tensordict, key, condition=subgoal, starts=starts)
+        allowed = None if self.action_mask_key is None else tensordict.get(self.action_mask_key)
+        action = choose(sub, wanted, tensordict, key, mask=allowed, condition=subgoal, starts=starts)
         if self.writes_values:
             tensordict.set(self.action_value_key, wanted)
         tensordict.set(self.action_key, action)

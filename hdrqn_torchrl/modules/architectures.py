@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import torch
 from torch import nn
-from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.data import TensorSpec
 
+from hdrqn_torchrl.envs.observations import code_sizes, observation_kind, observation_problem
+from hdrqn_torchrl.modules.code_features import CodeFeatures
+from hdrqn_torchrl.modules.decoders import CellDecoder, CodeDecoder, Decoder, ImageDecoder, VectorDecoder
 from hdrqn_torchrl.modules.features import (
-    SMALLEST_IMAGE,
     CellFeatures,
     CellsToImage,
     ChainedFeatures,
@@ -18,11 +20,11 @@ from hdrqn_torchrl.modules.features import (
     Features,
     FullyConnectedFeatures,
 )
-from hdrqn_torchrl.modules.prediction import CellDecoder, Decoder, ImageDecoder, ObservationPredictor
+from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.q_network import QNetwork
 from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
-_LARGEST_FLOAT = 10.0  # images in float32 with bounds above this are not taken to be scaled to about 1
+_COARSE = 14  # side of predicted images in pixels
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +33,7 @@ class Architecture:
 
     Args:
         hidden_size: H, size of the recurrent layer.
-        observation_features: makes the feature extractor for an observation spec.
+        observation_features: makes the feature extractor for an observation spec ``[N, ...]``.
         vector_features: makes the feature extractor for a vector of a given size (v2's meta-controller).
         gate_features: whether the subgoal also scales the features, besides being appended to them.
         observation_problem: takes an observation's spec and its shape without the batch dimensions; returns what an
@@ -99,31 +101,33 @@ class Architecture:
 def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Architecture:
     """The paper's networks: 44x44x3 image, 4 conv + ReLU (or 4 dense + ReLU on a vector) -> 256 -> LSTM -> dueling.
 
-    Cell codes are drawn as an image inside the network.
+    Cell codes are drawn as an image inside the network; other codes are read as a vector.
 
     Args:
         hidden_size: H, size of the LSTM.
         gate_features: whether the subgoal also scales the features, besides being appended to them.
     """
 
+    dense = (256, 256, 256, 256)
+
     def observation_features(spec: TensorSpec) -> Features:
-        if not is_grid(spec):
-            return ConvFeatures(spec.shape[-3], spec.shape[-1])
-        return ChainedFeatures(CellsToImage(spec.shape[-1], spec.n), ConvFeatures())
+        if observation_kind(spec, spec.shape[1:]) == "cells":
+            return ChainedFeatures(CellsToImage(spec.shape[-1], spec.n), ConvFeatures())
+        return _features(spec, dense, channels=(32, 64, 64, 64))
 
     return Architecture(
         hidden_size=hidden_size,
         gate_features=gate_features,
         observation_features=observation_features,
-        vector_features=lambda size: FullyConnectedFeatures(size, (256, 256, 256, 256)),
-        observation_problem=grid_or_image,
+        vector_features=lambda size: FullyConnectedFeatures(size, dense),
+        observation_problem=observation_problem,
     )
 
 
 def compact_network(
     hidden_size: int = 64, widths: Sequence[int] = (128,), *, gate_features: bool = True
 ) -> Architecture:
-    """Small networks on the same information: one-hot cells (or a narrow stack of convolutions) -> LSTM -> dueling.
+    """Small networks on the same information: one-hot codes (or a narrow stack of convolutions) -> LSTM -> dueling.
 
     Args:
         hidden_size: H, size of the LSTM.
@@ -136,69 +140,60 @@ def compact_network(
     sizes = check_widths(widths)
 
     def observation_features(spec: TensorSpec) -> Features:
-        if is_grid(spec):
-            return CellFeatures(spec.shape[-1], spec.n, sizes)
-        return ConvFeatures(spec.shape[-3], spec.shape[-1], sizes[-1], channels=(16, 32, 32, 32))
+        return _features(spec, sizes, channels=(16, 32, 32, 32))
 
     return Architecture(
         hidden_size=hidden_size,
         gate_features=gate_features,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, sizes),
-        observation_problem=grid_or_image,
+        observation_problem=observation_problem,
     )
 
 
-def grid_or_image(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | None:
-    """Checks that :func:`paper_network` and :func:`compact_network` can read an observation.
-
-    Args:
-        spec: spec of the observation.
-        shape: shape of the observation without the batch dimensions.
-
-    Returns:
-        What the observation must be and what to do about it; ``None`` if it can be read.
-    """
-    square = len(shape) >= 2 and shape[-1] == shape[-2]
-    if type(spec) is Categorical and not spec.dtype.is_floating_point and len(shape) == 2 and square:
-        return None
-    image = spec.dtype in (torch.uint8, torch.float32) and not isinstance(spec, Categorical | OneHot)
-    if isinstance(spec, Bounded) and spec.dtype == torch.float32:
-        image = bool(spec.space.high.max() <= _LARGEST_FLOAT)
-    if image and len(shape) == 3 and square and shape[-1] >= SMALLEST_IMAGE:
-        return None
-    return (
-        "a square of cell codes [V, V] (Categorical, integers) or a square image [channels, S, S] with "
-        f"S >= {SMALLEST_IMAGE} pixels, uint8 or float32 of about 1",
-        "use a Categorical spec for cell codes, ToTensorImage and Resize for images, and for anything else an "
-        "Architecture with your own observation_features",
-    )
-
-
-def is_grid(spec: TensorSpec) -> bool:
-    """Whether an observation spec is a window of cell codes (otherwise it is an image)."""
-    return isinstance(spec, Categorical)
+def _features(spec: TensorSpec, widths: tuple[int, ...], *, channels: tuple[int, int, int, int]) -> Features:
+    """The feature extractor for an observation ``[N, ...]``; ``channels`` are those of convolutions."""
+    shape = spec.shape[1:]
+    kind = observation_kind(spec, shape)
+    if kind == "cells":
+        return CellFeatures(shape[-1], spec.n, widths)
+    if kind == "codes":
+        return CodeFeatures(code_sizes(spec, shape), widths, num_dims=len(shape))
+    if kind == "image":
+        return ConvFeatures(shape[0], _sides(shape), widths[-1], channels)
+    return FullyConnectedFeatures(shape[-1], widths)
 
 
 def observation_predictor(
     spec: TensorSpec, hidden_size: int, num_actions: int, max_steps: int, width: int = 128
 ) -> ObservationPredictor:
-    """A predictor for an observation spec ``[N, ...]``: of cell codes, or of a coarse image.
+    """A predictor for an observation spec ``[N, ...]``: of codes, of a coarse image, or of a vector.
 
     Raises:
-        ValueError: if the observation is neither cell codes nor an image.
+        ValueError: if the built-in networks can't read the observation, either.
     """
-    if spec.ndim != (3 if is_grid(spec) else 4):
+    shape = spec.shape[1:]
+    kind = observation_kind(spec, shape)
+    if kind is None:
         raise ValueError(
-            f"prediction_steps must be 0 if the observation is neither cell codes [V, V] nor an image, got "
-            f"{max_steps} for {list(spec.shape)}; there is no decoder for it."
+            f"prediction_steps must be 0 if the observation is none that built-in networks read, got {max_steps} for "
+            f"{list(spec.shape)}; there is no decoder for it."
         )
 
     def decoder(in_features: int) -> Decoder:
-        if is_grid(spec):
-            return CellDecoder(in_features, spec.shape[-1], spec.n)
-        return ImageDecoder(in_features, spec.shape[-3])
+        if kind == "cells":
+            return CellDecoder(in_features, shape[-1], spec.n)
+        if kind == "codes":
+            return CodeDecoder(in_features, code_sizes(spec, shape), num_dims=len(shape))
+        if kind == "image":
+            height, width = _sides(shape)
+            return ImageDecoder(in_features, shape[0], (min(height, _COARSE), min(width, _COARSE)))
+        return VectorDecoder(in_features, shape[-1])
 
     return ObservationPredictor(
         decoder, hidden_size=hidden_size, num_actions=num_actions, max_steps=max_steps, width=width
     )
+
+
+def _sides(shape: Sequence[int]) -> tuple[int, int]:
+    return shape[-2], shape[-1]

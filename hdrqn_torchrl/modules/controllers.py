@@ -43,6 +43,7 @@ class SubController(TensorDictModuleBase):
         init_key: where the state restarts.
         hidden_key, cell_key: LSTM state ``[H]``.
         exploration_key: what the exploration carries, if anything.
+        mask_key: actions that can be chosen ``[A]`` bool; ``None``: all of them.
 
     Raises:
         ValueError: if network or ``exploration`` do not fit a flat or hierarchical agent.
@@ -72,6 +73,7 @@ class SubController(TensorDictModuleBase):
         hidden_key: NestedKey = keys.SUB_HIDDEN,
         cell_key: NestedKey = keys.SUB_CELL,
         exploration_key: NestedKey = keys.ACTION_EXPLORATION,
+        mask_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
         if (subgoal_key is None) != (network.num_conditions == 0):
@@ -87,9 +89,10 @@ class SubController(TensorDictModuleBase):
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
         self.hidden_key, self.cell_key, self.exploration_key = hidden_key, cell_key, exploration_key
+        self.mask_key = mask_key
         self.writes_values = False
         """Whether acting, too, writes its Q-values; for those who watch."""
-        self.in_keys = [observation_key, *([] if subgoal_key is None else [subgoal_key]), init_key]
+        self.in_keys = [observation_key, *(key for key in (subgoal_key, mask_key) if key is not None), init_key]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
         carried = [*self.state_keys, *carried_by(self.exploration, exploration_key)]
         self.in_keys += carried
@@ -123,9 +126,12 @@ class SubController(TensorDictModuleBase):
     def _choose(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
         starts = tensordict.get(self.init_key).squeeze(-1)
+        mask = None if self.mask_key is None else tensordict.get(self.mask_key)
         if self.writes_values:
             tensordict.set(self.action_value_key, value)
-        return choose(self.exploration, value, tensordict, self.exploration_key, condition=subgoal, starts=starts)
+        return choose(
+            self.exploration, value, tensordict, self.exploration_key, mask=mask, condition=subgoal, starts=starts
+        )
 
     def advance(self, tensordict: TensorDictBase, subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL) -> State:
         """LSTM state after one more observation, without a decision.

@@ -12,11 +12,10 @@ from torch.nn import functional
 
 from hdrqn_torchrl.devices import autocast_dtype
 from hdrqn_torchrl.envs.grid.cells import nearest_cell, palette
-from hdrqn_torchrl.modules.sizes import check_size, check_widths
+from hdrqn_torchrl.modules.sizes import check_sides, check_size, check_widths
 
 _USUAL_VIEW = 5
-SMALLEST_IMAGE = 33
-"""Side, in pixels, of the smallest image that the four convolutions accept."""
+_KERNELS_AND_STRIDES = ((5, 2), (3, 2), (3, 2), (3, 1))
 
 
 class Features(nn.Module):
@@ -60,42 +59,51 @@ class CellsToImage(nn.Module):
 class ConvFeatures(Features):
     """Four convolutions with ReLU, then one dense layer with ReLU: the paper's image features.
 
+    Kernels have sides of 5, 3, 3 and 3 pixels and strides of 2, 2, 2 and 1. Along a side of fewer than 33 pixels, a
+    stride is 1 where what 2 would leave is too short for the later kernels, and a kernel is as long as what is left if
+    that is shorter.
+
     Args:
         in_channels: channels of the image.
-        size: side of the image in pixels.
+        size: side of the image in pixels, or its height and width.
         out_features: number of features.
         channels: output channels of the four convolutions.
 
     Shapes:
-        ``[*, in_channels, size, size]`` uint8 in [0, 255] or float in [0, 1] -> ``[*, out_features]``.
+        ``[*, in_channels, height, width]`` uint8 in [0, 255] or float in [0, 1] -> ``[*, out_features]``.
 
     Examples:
         >>> ConvFeatures()(torch.zeros(2, 8, 3, 44, 44)).shape
         torch.Size([2, 8, 256])
+        >>> ConvFeatures(in_channels=4, size=(10, 7))(torch.zeros(2, 4, 10, 7)).shape
+        torch.Size([2, 256])
     """
 
     def __init__(
         self,
         in_channels: int = 3,
-        size: int = 44,
+        size: int | tuple[int, int] = 44,
         out_features: int = 256,
         channels: tuple[int, int, int, int] = (32, 64, 64, 64),
     ) -> None:
         super().__init__()
         check_size("in_channels", in_channels, "3 for colour images, 1 for grey images")
-        check_size("size", size, "44, as in the paper", least=SMALLEST_IMAGE)
+        height, width = check_sides(size, "44, as in the paper")
         check_size("out_features", out_features, 256)
         check_widths(channels, "channels")
         if len(channels) != 4:
             raise ValueError(f"channels must be four sizes, got {len(channels)}; the paper uses (32, 64, 64, 64).")
-        kernels_and_strides = ((5, 2), (3, 2), (3, 2), (3, 1))
+        (along, height), (across, width) = _fitted(height), _fitted(width)
         layers: list[nn.Module] = []
-        previous, side = in_channels, size
-        for width, (kernel, stride) in zip(channels, kernels_and_strides, strict=True):
-            layers += [nn.Conv2d(previous, width, kernel, stride), nn.ReLU(inplace=True)]
-            previous, side = width, (side - kernel) // stride + 1
+        previous = in_channels
+        for number, down, right in zip(channels, along, across, strict=True):
+            kernel, stride = zip(down, right, strict=True)
+            layers += [nn.Conv2d(previous, number, kernel, stride), nn.ReLU(inplace=True)]
+            previous = number
         self.convolutions = nn.Sequential(*layers).to(memory_format=torch.channels_last)  # fast in oneDNN and cuDNN
-        self.dense = nn.Sequential(nn.Flatten(), nn.Linear(previous * side * side, out_features), nn.ReLU(inplace=True))
+        self.dense = nn.Sequential(
+            nn.Flatten(), nn.Linear(previous * height * width, out_features), nn.ReLU(inplace=True)
+        )
         self.out_features = out_features
 
     def forward(self, image: Tensor) -> Tensor:
@@ -137,14 +145,14 @@ class CellFeatures(Features):
         _check_grid(view, num_codes)
         scale = min(1.0, (_USUAL_VIEW / view) ** 2)
         self.register_buffer("_one_hot", torch.eye(num_codes) * scale, persistent=False)
-        self.dense = _dense_layers(view * view * num_codes, widths)
+        self.dense = dense_layers(view * view * num_codes, widths)
         with torch.no_grad():
             next(self.dense.parameters()).div_(scale)
         self.out_features = widths[-1]
 
     def forward(self, cells: Tensor) -> Tensor:
         one_hot = self._one_hot.to(autocast_dtype(self._one_hot))
-        return _on_rows(self.dense, functional.embedding(cells.flatten(-2).int(), one_hot).flatten(-2))
+        return on_rows(self.dense, functional.embedding(cells.flatten(-2).int(), one_hot).flatten(-2))
 
 
 class FullyConnectedFeatures(Features):
@@ -161,13 +169,13 @@ class FullyConnectedFeatures(Features):
     def __init__(self, in_features: int, widths: tuple[int, ...] = (256, 256, 256, 256)) -> None:
         super().__init__()
         check_size("in_features", in_features, "the size of the vector")
-        self.dense = _dense_layers(in_features, widths)
+        self.dense = dense_layers(in_features, widths)
         self.out_features = widths[-1]
 
     def forward(self, vector: Tensor) -> Tensor:
         if not vector.is_floating_point():
             vector = vector.to(next(self.dense.parameters()).dtype)
-        return _on_rows(self.dense, vector)
+        return on_rows(self.dense, vector)
 
 
 class ChainedFeatures(Features):
@@ -181,12 +189,26 @@ class ChainedFeatures(Features):
         return self.features(self.first(observation))
 
 
+def _fitted(side: int) -> tuple[list[tuple[int, int]], int]:
+    """Kernels and strides of the four convolutions along a side, and what they leave of it."""
+    fitted = []
+    for index, (kernel, stride) in enumerate(_KERNELS_AND_STRIDES):
+        kernel = min(kernel, side)
+        needed = 1 + sum(later - 1 for later, _ in _KERNELS_AND_STRIDES[index + 1 :])
+        if (side - kernel) // stride + 1 < needed:
+            stride = 1
+        fitted.append((kernel, stride))
+        side = (side - kernel) // stride + 1
+    return fitted, side
+
+
 def _check_grid(view: int, num_codes: int) -> None:
     check_size("view", view, 5)
     check_size("num_codes", num_codes, "the number of different cells")
 
 
-def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
+def dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
+    """Dense layers of these sizes, each with ReLU."""
     layers: list[nn.Module] = []
     for width in check_widths(widths):
         layers += [nn.Linear(in_features, width), nn.ReLU(inplace=True)]
@@ -194,7 +216,7 @@ def _dense_layers(in_features: int, widths: tuple[int, ...]) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _on_rows(layers: nn.Sequential, vectors: Tensor) -> Tensor:
+def on_rows(layers: nn.Sequential, vectors: Tensor) -> Tensor:
     """Applies layers to ``[*, I]`` as rows, because autograd copies a lot when ReLU writes into a view."""
     rows = layers(vectors.reshape(-1, vectors.shape[-1]))
     return rows.view(*vectors.shape[:-1], rows.shape[-1])

@@ -8,85 +8,11 @@ sufficient for optimal control (approximate information states; Subramanian et a
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
+from hdrqn_torchrl.modules.decoders import DecoderFactory
 from hdrqn_torchrl.modules.sizes import check_size
-
-
-class Decoder(nn.Module):
-    """Predicts an observation from a vector, and measures the error."""
-
-    def error(self, vector: Tensor, observation: Tensor) -> Tensor:
-        """Error ``[*]`` of the prediction from ``vector`` ``[*, D]``, given the true ``observation`` ``[*, ...]``."""
-        raise NotImplementedError
-
-
-class DecoderFactory(Protocol):
-    """Makes a decoder for vectors of a given size."""
-
-    def __call__(self, in_features: int) -> Decoder: ...
-
-
-class CellDecoder(Decoder):
-    """Predicts the code of every cell of a window; the error is the mean cross-entropy (nats per cell).
-
-    Args:
-        in_features: D.
-        view: side of the window in cells.
-        num_codes: number of cell codes.
-
-    Examples:
-        >>> decoder = CellDecoder(8, view=5, num_codes=5)
-        >>> decoder.error(torch.zeros(2, 3, 8), torch.zeros(2, 3, 5, 5, dtype=torch.uint8)).shape
-        torch.Size([2, 3])
-    """
-
-    def __init__(self, in_features: int, view: int, num_codes: int) -> None:
-        super().__init__()
-        for name, value, usual in (("in_features", in_features, 128), ("view", view, 5), ("num_codes", num_codes, 5)):
-            check_size(name, value, usual)
-        self.logits = nn.Linear(in_features, view * view * num_codes)
-        self.num_codes = num_codes
-
-    def error(self, vector: Tensor, observation: Tensor) -> Tensor:
-        logits = self.logits(vector).unflatten(-1, (-1, self.num_codes)).float()
-        cells = observation.flatten(-2).long()
-        picked = logits.gather(-1, cells.unsqueeze(-1)).squeeze(-1)
-        return (logits.logsumexp(-1) - picked).mean(-1)
-
-
-class ImageDecoder(Decoder):
-    """Predicts a coarse version of an image; the error is the mean squared error of intensities in [0, 1].
-
-    Args:
-        in_features: D.
-        channels: number of channels of the image.
-        size: side of the coarse image in pixels.
-
-    Examples:
-        >>> decoder = ImageDecoder(8, channels=3)
-        >>> decoder.error(torch.zeros(2, 3, 8), torch.zeros(2, 3, 3, 44, 44, dtype=torch.uint8)).shape
-        torch.Size([2, 3])
-    """
-
-    def __init__(self, in_features: int, channels: int, size: int = 14) -> None:
-        super().__init__()
-        for name, value, usual in (("in_features", in_features, 128), ("channels", channels, 3), ("size", size, 14)):
-            check_size(name, value, usual)
-        self.pixels = nn.Linear(in_features, channels * size * size)
-        self.size = size
-
-    def error(self, vector: Tensor, observation: Tensor) -> Tensor:
-        images = observation.reshape(-1, *observation.shape[-3:]).float()
-        coarse = functional.adaptive_avg_pool2d(images, self.size)
-        if observation.dtype == torch.uint8:
-            coarse /= 255
-        guess = self.pixels(vector).float().flatten(0, -2)
-        return (guess - coarse.flatten(1)).square().mean(-1).view(vector.shape[:-1])
 
 
 class ObservationPredictor(nn.Module):
@@ -103,6 +29,7 @@ class ObservationPredictor(nn.Module):
         ValueError: if a value breaks its rule.
 
     Examples:
+        >>> from hdrqn_torchrl.modules import CellDecoder
         >>> predictor = ObservationPredictor(lambda size: CellDecoder(size, 5, 5), hidden_size=8, num_actions=4)
         >>> memory, action = torch.zeros(2, 7, 8), torch.zeros(2, 7, dtype=torch.int64)
         >>> observation = torch.zeros(2, 7, 5, 5, dtype=torch.uint8)

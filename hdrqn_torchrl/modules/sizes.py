@@ -42,3 +42,19 @@ def check_widths(widths: Sequence[int], name: str = "widths") -> tuple[int, ...]
     for place, size in enumerate(sizes):
         check_size(f"{name}[{place}]", size, 128)
     return sizes
+
+
+def check_sides(size: int | tuple[int, int], usual: int | str) -> tuple[int, int]:
+    """Checks the side of a square, or height and width of an image, and returns height and width.
+
+    Raises:
+        ValueError: if it is neither, or :func:`check_size` refuses one of them.
+    """
+    if not isinstance(size, Sequence) or isinstance(size, str):
+        check_size("size", size, usual)
+        return size, size
+    if len(size) != 2:
+        raise ValueError(f"size must be one number, or height and width, got {size!r}; use {usual}.")
+    for place, side in enumerate(size):
+        check_size(f"size[{place}]", side, usual)
+    return size[0], size[1]

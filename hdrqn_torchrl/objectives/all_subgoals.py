@@ -155,6 +155,7 @@ class AllSubgoalsLoss(SequenceLoss):
         )
         self.rules = make_rules(
             policy.subgoal_keys,
+            action_mask_key=policy.action_mask_key,
             **rates,
             reached_reward=reached_reward,
             wrong_subgoal_reward=wrong_subgoal_reward,
@@ -179,6 +180,7 @@ class AllSubgoalsLoss(SequenceLoss):
         policy, k = self._networks[0], self.tensor_keys
         read = [policy.observation_key, policy.previous_action_key, policy.init_key, *policy.mask_keys, k.action]
         read += [*self.state_keys, *(each.option_init for each in policy.subgoal_keys)]
+        read += [] if policy.action_mask_key is None else [policy.action_mask_key]
         nexts = [k.extrinsic_reward, k.done, k.terminated]
         nexts += [key for each in policy.subgoal_keys for key in (each.attained, each.active_subgoal)]
         nexts += [k.hazard] if self.reads_hazard else []

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from hdrqn_torchrl.keys import OptionKeys
@@ -28,6 +28,7 @@ class LevelRule:
         gamma: discount of one environment step.
         choices: entries of the subgoals that it chooses among; ``None``: actions.
         pursues: entries of the subgoals that it is given; ``None``: the task.
+        mask_key: which of its choices there are; ``None``: all.
         rewards: the critic's rewards for reaching them; ``None`` at the top.
         largest_return, smallest_return: bounds of its targets.
     """
@@ -36,6 +37,7 @@ class LevelRule:
     gamma: float
     choices: OptionKeys | None
     pursues: OptionKeys | None
+    mask_key: NestedKey | None
     rewards: IntrinsicReward | None = None
     largest_return: float = math.inf
     smallest_return: float = -math.inf
@@ -104,7 +106,8 @@ class LevelTargets:
             tensordict: the sequences ``[B, T + 1]``.
             events: the outcomes of their steps.
         """
-        agrees = online[0].argmax(-1) == action.unsqueeze(-1)  # [B, T + 1, C]: the greedy action for c was taken
+        greedy = greedy_choice(online[0], _mask(self.rules[0], tensordict))
+        agrees = greedy == action.unsqueeze(-1)  # [B, T + 1, C]: the greedy action for c was taken
         found = [self._of_actions(self.rules[0], online[0], target[0], agrees, tensordict, events)]
         for index, rule in enumerate(self.rules[1:], 1):
             if index > 1:  # whether the greedy choice for c of the level below agrees
@@ -123,7 +126,7 @@ class LevelTargets:
         events: StepEvents,
     ) -> Columns:
         """Level 0: every step completes its action, so the best action follows."""
-        best = double_q_value(online if self.double else target, target)[:, 1:]
+        best = double_q_value(online if self.double else target, target, _mask(rule, tensordict))[:, 1:]
         trace = watkins_trace(agrees, self.trace_decay)[:, :-1]
         trained = torch.ones_like(best, dtype=torch.bool)
         return self._finish(rule, best.unsqueeze(-1), trace.unsqueeze(-1), trained.unsqueeze(-1), tensordict, events)
@@ -210,6 +213,7 @@ class LevelTargets:
 def make_rules(
     subgoals: Sequence[OptionKeys],
     *,
+    action_mask_key: NestedKey | None = None,
     sub_gamma: float,
     middle_gamma: float,
     meta_gamma: float,
@@ -223,6 +227,7 @@ def make_rules(
 
     Args:
         subgoals: entries of each set of subgoals, from near to far; empty: an agent of one level.
+        action_mask_key: actions that there are; ``None``: all.
         sub_gamma, middle_gamma, meta_gamma: discounts of level 0, of the levels in between, and of the top level.
         reached_reward, hazard_reward: the critic's rewards.
         wrong_subgoal_reward: the critic's penalties (:func:`~hdrqn_torchrl.transforms.penalties_of_sets`).
@@ -246,6 +251,7 @@ def make_rules(
                 gamma=gamma,
                 choices=choices,
                 pursues=pursues,
+                mask_key=action_mask_key if choices is None else choices.subgoal_mask,
                 rewards=rewards,
                 largest_return=largest,
                 smallest_return=smallest,
@@ -260,10 +266,9 @@ def _pursued(names: OptionKeys, steps: TensorDictBase) -> Tensor:
     return active.unsqueeze(-1) == torch.arange(number, device=active.device)
 
 
-def _mask(rule: LevelRule, tensordict: TensorDictBase) -> Tensor:
-    """The subgoals that the level can choose, ``[B, T + 1, 1, X]``."""
-    assert rule.choices is not None
-    return tensordict[rule.choices.subgoal_mask].unsqueeze(-2)
+def _mask(rule: LevelRule, tensordict: TensorDictBase) -> Tensor | None:
+    """What the level can choose, ``[B, T + 1, 1, X]`` bool; ``None``: everything."""
+    return None if rule.mask_key is None else tensordict[rule.mask_key].unsqueeze(-2)
 
 
 def _ends_in_sequence(names: OptionKeys, tensordict: TensorDictBase, events: StepEvents) -> Tensor:

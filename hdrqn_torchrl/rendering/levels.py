@@ -63,6 +63,8 @@ class Level:
     note: str = ""
     brief: bool = False
     """Whether it takes one line only: the choice, without bars."""
+    excluded: str = "reached"
+    """Why choices are not allowed."""
 
     def bar(self, index: int) -> float:
         """Length of a bar in [0, 1]: 1 for the best, 0 for a choice that is worse by ``span`` or more, or excluded."""
@@ -73,14 +75,15 @@ class Level:
 
     def remark(self, index: int) -> str:
         """Why a choice has no bar."""
-        return "" if self.decision.allowed[index] else "reached"
+        return "" if self.decision.allowed[index] else self.excluded
 
 
 def levels_of(frame: Frame, spans: BarSpans) -> list[Level]:
     """What each level decided, from the farthest subgoals to the action; those between are brief."""
     scene = frame.scene
     symbol, ink = "Q" if frame.subgoal is None else "Qˢ", [ACTION_COLOUR] * len(scene.action_names)
-    levels = [Level("does", symbol, frame.action, scene.action_names, ink, spans.action, _chance(frame.action))]
+    note = _chance(frame.action)
+    levels = [Level("does", symbol, frame.action, scene.action_names, ink, spans.action, note, excluded="not now")]
     for nearer in frame.pursuits[:-1]:
         ink = [ACTION_COLOUR] * len(nearer.names)
         levels.insert(0, Level("by way of", "Q", nearer.decision, nearer.names, ink, 1.0, _note(nearer), brief=True))

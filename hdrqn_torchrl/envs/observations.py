@@ -1,0 +1,114 @@
+"""The kinds of observations that built-in networks read, told apart by their specs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import torch
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
+
+ObservationKind = Literal["cells", "codes", "image", "vector"]
+
+_LARGEST_FLOAT = 10.0  # images in float32 with bounds above this are not taken to be scaled to about 1
+_MOST_COLOURS = 4  # an image whose last dimension is no larger has its channels there
+READABLE = (
+    "a square of cell codes [V, V] (Categorical, integers), other codes (MultiCategorical or Categorical, integers), "
+    "an image [channels, height, width] (uint8, or float32 of about 1) or a vector [D] (float32)"
+)
+
+
+def observation_kind(spec: TensorSpec, shape: Sequence[int]) -> ObservationKind | None:
+    """What an observation is to the built-in networks.
+
+    Args:
+        spec: spec of the observation.
+        shape: its shape without the batch dimensions.
+
+    Returns:
+        ``"cells"`` (a square of cell codes), ``"codes"`` (any other codes, each entry with its own number of them),
+        ``"image"``, ``"vector"``; ``None``: none of these.
+
+    Examples:
+        >>> observation_kind(MultiCategorical([5, 3], shape=(8, 2)), [2])
+        'codes'
+        >>> observation_kind(Bounded(0, 255, shape=(8, 3, 44, 60), dtype=torch.uint8), [3, 44, 60])
+        'image'
+    """
+    if isinstance(spec, Binary | OneHot):
+        return "vector" if len(shape) == 1 else None
+    if isinstance(spec, Categorical):
+        if spec.dtype.is_floating_point or not math.prod(shape):
+            return None
+        is_square = len(shape) == 2 and shape[0] == shape[1]
+        return "cells" if is_square and type(spec) is Categorical else "codes"
+    if not math.prod(shape):
+        return None
+    if len(shape) == 1:
+        return "vector" if spec.dtype == torch.float32 else None
+    return "image" if len(shape) == 3 and _is_image(spec, shape) else None
+
+
+def observation_problem(spec: TensorSpec, shape: Sequence[int]) -> tuple[str, str] | None:
+    """Why the built-in networks can't read an observation.
+
+    Args:
+        spec: spec of the observation.
+        shape: its shape without the batch dimensions.
+
+    Returns:
+        What the observation must be and what to do about it; ``None`` if it can be read.
+    """
+    if observation_kind(spec, shape) is not None:
+        return None
+    own = "or use an Architecture with your own observation_features"
+    return READABLE, f"{_remedy(spec, shape)}, {own}"
+
+
+def code_sizes(spec: TensorSpec, shape: Sequence[int]) -> tuple[int, ...]:
+    """How many codes each entry of an observation has, in the order of its flattened entries.
+
+    Args:
+        spec: a ``Categorical`` or ``MultiCategorical``.
+        shape: its shape without the batch dimensions.
+
+    Examples:
+        >>> code_sizes(MultiCategorical([5, 3], shape=(8, 2)), [2]), code_sizes(Categorical(4, shape=(8, 3)), [3])
+        ((5, 3), (4, 4, 4))
+    """
+    entries = math.prod(shape)
+    if isinstance(spec, MultiCategorical):
+        return tuple(spec.nvec.expand(spec.shape).reshape(-1, entries)[0].tolist())
+    return (int(spec.space.n),) * entries
+
+
+def _is_image(spec: TensorSpec, shape: Sequence[int]) -> bool:
+    if _has_channels_last(shape):
+        return False
+    if spec.dtype == torch.float32:
+        return not isinstance(spec, Bounded) or bool(spec.space.high.max() <= _LARGEST_FLOAT)
+    return spec.dtype == torch.uint8
+
+
+def _has_channels_last(shape: Sequence[int]) -> bool:
+    return shape[-1] <= _MOST_COLOURS < min(shape[0], shape[1])
+
+
+def _remedy(spec: TensorSpec, shape: Sequence[int]) -> str:
+    """What to do about an observation that is of no kind."""
+    if spec.dtype == torch.float64:
+        return "cast it to float32, for instance with DoubleToFloat"
+    if len(shape) == 3 and _has_channels_last(shape):
+        return "put the channels first, for instance with ToTensorImage or PermuteTransform"
+    if len(shape) == 3 and spec.dtype == torch.float32:
+        return "divide it by its largest value, for instance with ToTensorImage"
+    if len(shape) == 2:
+        return (
+            "give an image a dimension for its channels with UnsqueezeTransform, make a vector of others by flattening"
+        )
+    if not spec.dtype.is_floating_point:
+        return (
+            "use a MultiCategorical spec if its numbers are codes that begin at 0, cast them to float32 if quantities"
+        )
+    return "flatten it, or cast it to float32"
