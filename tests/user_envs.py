@@ -28,6 +28,7 @@ class Corridor(EnvBase):
         without: entries that the environment does not write.
         odd: specs that differ, by entry; what is written is drawn from them.
         task: what it says about itself.
+        masked: says that steps into the ends' walls can't be chosen, and fails if one is.
         seed: of nothing: train.py gives it to every environment, as it does device.
         device: of all tensors.
     """
@@ -42,13 +43,14 @@ class Corridor(EnvBase):
         without: Sequence[str] = ("hazard", "success"),
         odd: dict[str, TensorSpec] | None = None,
         task: Task | None = None,
+        masked: bool = False,
         seed: int = 0,
         device: str = "cpu",
     ) -> None:
         batch = () if num_envs is None else (num_envs,)
         super().__init__(device=device, batch_size=batch)
         self.pays, self.length, self.num_goals = pays, length, num_goals
-        self.odd = odd or {}
+        self.odd, self.masked = odd or {}, masked
         if task is not None:
             self.task = task
         one = (*batch, 1)
@@ -58,6 +60,8 @@ class Corridor(EnvBase):
             "hazard": Binary(shape=one, dtype=torch.bool),
             "success": Binary(shape=one, dtype=torch.bool),
         }
+        if masked:
+            observations["action_mask"] = Binary(shape=(*batch, 2), dtype=torch.bool)
         rewards = {key: Unbounded(shape=one) for key in ("reward", "extrinsic_reward")}
         ends = {key: Binary(shape=one, dtype=torch.bool) for key in ("done", "terminated", "truncated")}
         self.observation_spec = self._composite(observations, without)
@@ -90,9 +94,16 @@ class Corridor(EnvBase):
     def _step(self, tensordict):
         action = tensordict.get("action")
         move = 2 * action - 1 if action.shape == self.batch_size else torch.ones_like(self._place)
+        if self.masked:
+            doors = self._doors() | ~self._doors().any(-1, keepdim=True)
+            assert doors.gather(-1, action.unsqueeze(-1)).all(), "an action that can't be chosen was chosen"
         before, self._place = self._place, (self._place + move).clamp(0, CELLS - 1)
         self._steps = self._steps + 1
         return self._written(self._place != before, self.observation_spec, self.full_reward_spec, self.full_done_spec)
+
+    def _doors(self):
+        """Which ways are open, ``[N, 2]``."""
+        return torch.stack([self._place > 0, self._place < CELLS - 1], -1)
 
     def _written(self, moved, *specs):
         ends = torch.stack([self._place == 0, self._place == CELLS - 1], -1) & moved.unsqueeze(-1)
@@ -101,6 +112,7 @@ class Corridor(EnvBase):
         values = {
             "observation": self._place[..., None, None].to(torch.uint8),
             "attained": ends,
+            "action_mask": self._doors(),
             "hazard": torch.zeros_like(moved)[..., None],
             "success": ends[..., -1:],
             "reward": pay[..., None],

@@ -15,6 +15,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
+from hdrqn_torchrl.envs.check_choices import check_masks, check_observation, random_actions
 from hdrqn_torchrl.envs.findings import Finding, missing, wrong
 from hdrqn_torchrl.envs.specs import check_is_environment
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
@@ -81,6 +82,8 @@ def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
     wanted |= {keys.DONE: 1, keys.TERMINATED: 1, keys.TRUNCATED: 1}
     for each in _sets(env, task):
         wanted |= {each.keys.attained: len(each), each.keys.available: len(each)}
+    if isinstance(action, Categorical):
+        wanted[keys.ACTION_MASK] = action.n
     for key, size in wanted.items():
         kind = torch.float32 if key in (keys.REWARD, keys.EXTRINSIC_REWARD) else torch.bool
         if (spec := specs.get(key)) is None:
@@ -94,6 +97,7 @@ def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
     for each in task.subgoals:
         if each.keys.attained not in specs:
             yield wrong(f"{each.keys.attained!r} is missing, though its subgoals are stated", "no agent pursues them")
+    yield from check_observation(env)
     yield from _optional(specs, task)
 
 
@@ -146,7 +150,7 @@ def _behaviour(env: EnvBase, task: Task, steps: int, seed: int) -> list[Finding]
     if found:
         return found
     for rollout in (first, other):
-        found += [*_ends(rollout, task), *_returns(rollout, task)]
+        found += [*_ends(rollout, task), *_returns(rollout, task), *check_masks(rollout)]
         for each in _sets(env, task):
             found += _attained(rollout, each)
     return [*found, *_seeds(first, again, other), *_round_trip(env)]
@@ -162,7 +166,7 @@ def _rollout(env: EnvBase, steps: int, seed: int, actions_seed: int) -> Rollout:
 def _go_on(env: EnvBase, tensordict: TensorDictBase, steps: int) -> Rollout:
     rollout = []
     for _ in range(steps):
-        step, tensordict = env.step_and_maybe_reset(env.rand_action(tensordict))
+        step, tensordict = env.step_and_maybe_reset(random_actions(env, tensordict))
         rollout.append(step.clone())
     return rollout
 
@@ -274,7 +278,7 @@ def _is_random(rollout: Rollout) -> bool:
 def _round_trip(env: EnvBase) -> Iterator[Finding]:
     """Whether an environment goes on from a stored state as it would have."""
     base = getattr(env, "base_env", env)
-    tensordict = env.step_and_maybe_reset(env.rand_action(env.reset()))[1]
+    tensordict = env.step_and_maybe_reset(random_actions(env, env.reset()))[1]
     state = deepcopy(base.state_dict())
     if not state:
         yield missing("state_dict() returns nothing", "no resume: a training that was stopped starts from scratch")

@@ -12,9 +12,11 @@ from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, OneHot,
 ObservationKind = Literal["cells", "codes", "image", "vector"]
 
 _LARGEST_FLOAT = 10.0  # images in float32 with bounds above this are not taken to be scaled to about 1
+_MOST_CODES = 1_000_000  # of all entries of a vector of bounded integers; it has as many rows of weights
 _MOST_COLOURS = 4  # an image whose last dimension is no larger has its channels there
 READABLE = (
-    "a square of cell codes [V, V] (Categorical, integers), other codes (MultiCategorical or Categorical, integers), "
+    "a square of cell codes [V, V] (Categorical, integers), other codes (MultiCategorical, Categorical, or a Bounded "
+    "vector of integers from 0), "
     "an image [channels, height, width] (uint8, or float32 of about 1) or a vector [D] (float32)"
 )
 
@@ -45,6 +47,8 @@ def observation_kind(spec: TensorSpec, shape: Sequence[int]) -> ObservationKind 
         return "cells" if is_square and type(spec) is Categorical else "codes"
     if not math.prod(shape):
         return None
+    if len(shape) == 1 and not spec.dtype.is_floating_point:
+        return "codes" if isinstance(spec, Bounded) and _counts(spec) else None
     if len(shape) == 1:
         return "vector" if spec.dtype == torch.float32 else None
     return "image" if len(shape) == 3 and _is_image(spec, shape) else None
@@ -70,7 +74,7 @@ def code_sizes(spec: TensorSpec, shape: Sequence[int]) -> tuple[int, ...]:
     """How many codes each entry of an observation has, in the order of its flattened entries.
 
     Args:
-        spec: a ``Categorical`` or ``MultiCategorical``.
+        spec: a ``Categorical``, ``MultiCategorical`` or ``Bounded`` from 0.
         shape: its shape without the batch dimensions.
 
     Examples:
@@ -80,7 +84,16 @@ def code_sizes(spec: TensorSpec, shape: Sequence[int]) -> tuple[int, ...]:
     entries = math.prod(shape)
     if isinstance(spec, MultiCategorical):
         return tuple(spec.nvec.expand(spec.shape).reshape(-1, entries)[0].tolist())
+    if isinstance(spec, Bounded):
+        return tuple((spec.space.high.expand(spec.shape).reshape(-1, entries)[0].long() + 1).tolist())
     return (int(spec.space.n),) * entries
+
+
+def _counts(spec: Bounded) -> bool:
+    """Whether bounded integers ``[*, D]`` can be taken for codes."""
+    low, high = spec.space.low, spec.space.high
+    known = bool((low == 0).all()) and bool((high < _MOST_CODES).all())
+    return known and sum(code_sizes(spec, spec.shape[-1:])) <= _MOST_CODES
 
 
 def _is_image(spec: TensorSpec, shape: Sequence[int]) -> bool:
@@ -109,6 +122,6 @@ def _remedy(spec: TensorSpec, shape: Sequence[int]) -> str:
         )
     if not spec.dtype.is_floating_point:
         return (
-            "use a MultiCategorical spec if its numbers are codes that begin at 0, cast them to float32 if quantities"
+            "cast it to float32 if its numbers are quantities; if they are codes, number them from 0 (MultiCategorical)"
         )
     return "flatten it, or cast it to float32"

@@ -21,7 +21,13 @@ class CodeFeatures(Features):
     """Code vectors, whose entries have numbers of codes of their own, through dense layers.
 
     The first layer is a dense layer on one-hot codes: each code of each entry has a row of weights, and the rows of
-    the codes seen are added up. That costs less than to make the one-hot vectors.
+    the codes seen are added up. That costs less than making the one-hot vectors.
+
+    Adam changes the rows of all D entries by about the learning rate at once, so that a longer vector means larger
+    steps. For more than 25 entries the sum is therefore scaled by the root of 25 / D, and the initial rows by its
+    inverse: steps are then equally large if the entries pull in different directions. (With 25 / D, the rule of
+    :class:`CellFeatures`, they would be if all pulled in the same one; but what depends on a few of 150 entries is
+    then learned much more slowly.)
 
     Args:
         num_codes: number of codes of each entry, in the order of the flattened entries.

@@ -2,21 +2,37 @@
 
 import pickle
 import re
+from dataclasses import replace
 from functools import partial
 
 import gymnasium
 import pytest
 import torch
 from helpers import ALGORITHMS, build, collect, small_env
-from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, Composite, MultiCategorical, MultiOneHot, OneHot, Unbounded
 from torchrl.envs import DTypeCastTransform, GymWrapper, ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
 from user_envs import Corridor, Walk
 
 from hdrqn_torchrl.algorithms import make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import make_montezuma
-from hdrqn_torchrl.modules import Architecture, FullyConnectedFeatures, compact_network
+from hdrqn_torchrl.modules import Architecture, Features, FullyConnectedFeatures, compact_network
 
 EVERY = [*ALGORITHMS, "v3"]
+
+
+class _Flattened(Features):
+    """Observations ``[2, 4]`` through one dense layer."""
+
+    out_features = 8
+
+    def __init__(self):
+        super().__init__()
+        self.dense = torch.nn.Linear(8, 8)
+
+    def forward(self, observation):
+        return self.dense(observation.flatten(-2))
+
+
 N = 4
 PLAIN = Architecture(
     hidden_size=8,
@@ -75,11 +91,8 @@ class TestActions:
         assert "pass categorical_action_encoding=True to GymEnv or GymWrapper" in message
 
     def test_gym_wrapper_is_refused_only_with_its_default_action_encoding(self):
-        envs = [
-            SerialEnv(2, partial(cart_pole, **settings)) for settings in ({}, {"categorical_action_encoding": True})
-        ]
-        messages = [refusal("dqn", env) for env in envs]
-        assert ["categorical_action_encoding" in message for message in messages] == [True, False]
+        assert "categorical_action_encoding" in refusal("dqn", SerialEnv(2, cart_pole))
+        build("dqn", SerialEnv(2, partial(cart_pole, categorical_action_encoding=True)))
 
     @pytest.mark.parametrize(
         ("spec", "remedy"),
@@ -101,37 +114,18 @@ class TestObservations:
     @pytest.mark.parametrize(
         "spec",
         [
-            Unbounded(shape=(N, 4)),
-            Bounded(0, 255, shape=(N, 3, 44, 60), dtype=torch.uint8),
+            Unbounded(shape=(N, 4), dtype=torch.float64),
+            Unbounded(shape=(N, 4), dtype=torch.int64),
             Bounded(0, 255, shape=(N, 44, 44), dtype=torch.uint8),
             Bounded(0, 255, shape=(N, 44, 44, 3), dtype=torch.uint8),
             Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.int32),
-            Unbounded(shape=(N, 3, 44, 44), dtype=torch.float64),
             Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.float32),
-            Bounded(0, 255, shape=(N, 3, 20, 20), dtype=torch.uint8),
-            Categorical(5, shape=(N,), dtype=torch.int64),
-            Categorical(5, shape=(N, 3, 4), dtype=torch.uint8),
-            MultiCategorical([5, 3], shape=(N, 2)),
         ],
-        ids=[
-            "vector",
-            "not square",
-            "no channels",
-            "HWC",
-            "int32",
-            "float64",
-            "0 to 255",
-            "tiny",
-            "number",
-            "3x4 cells",
-            "numbers",
-        ],
+        ids=["float64", "int64 without bounds", "no channels", "HWC", "int32 image", "0 to 255"],
     )
     def test_observations_that_networks_cannot_read_are_refused(self, name, spec):
         message = refusal(name, Corridor(N, without=("success",), odd={"observation": spec}))
-        assert (
-            "'observation' must be a square of cell codes [V, V] (Categorical, integers) or a square image" in message
-        )
+        assert "'observation' must be a square of cell codes [V, V] (Categorical, integers), other codes" in message
         assert f"got {list(spec.shape)} {str(spec.dtype).removeprefix('torch.')} ({type(spec).__name__})" in message
 
     @pytest.mark.parametrize(
@@ -139,9 +133,14 @@ class TestObservations:
         [
             Categorical(5, shape=(N, 3, 3), dtype=torch.int64),
             Bounded(0, 255, shape=(N, 1, 33, 33), dtype=torch.uint8),
+            Bounded(0, 255, shape=(N, 4, 10, 7), dtype=torch.uint8),
             Unbounded(shape=(N, 2, 40, 40)),
+            Unbounded(shape=(N, 4)),
+            MultiCategorical([5, 3], shape=(N, 2), dtype=torch.uint8),
+            Categorical(5, shape=(N, 3, 4), dtype=torch.uint8),
+            Categorical(5, shape=(N,), dtype=torch.int64),
         ],
-        ids=["int64 cells", "grey", "floats"],
+        ids=["int64 cells", "grey", "small image", "floats", "vector", "codes", "3x4 cells", "number"],
     )
     @pytest.mark.parametrize("name", ["dqn", "v2", "v3"])
     def test_agents_learn_from_every_observation_that_networks_can_read(self, name, spec):
@@ -159,10 +158,25 @@ class TestObservations:
 
     @pytest.mark.parametrize("name", ["drqn", "v2", "v3"])
     def test_observations_without_decoder_cannot_be_predicted(self, name):
-        env = Corridor(N, odd={"observation": Unbounded(shape=(N, 4))})
-        with pytest.raises(ValueError, match=r"prediction_steps must be 0 if .*, got 3 for \[4, 4\]"):
-            build(name, env, PLAIN, prediction_steps=3)
-        build(name, env, PLAIN, prediction_steps=0)
+        env = Corridor(N, odd={"observation": Unbounded(shape=(N, 2, 4))})
+        plain = replace(PLAIN, observation_features=lambda spec: _Flattened())
+        with pytest.raises(ValueError, match=r"prediction_steps must be 0 if .*, got 3 for \[4, 2, 4\]"):
+            build(name, env, plain, prediction_steps=3)
+        build(name, env, plain, prediction_steps=0)
+
+    @pytest.mark.parametrize("dtype", [torch.uint8, torch.int64])
+    def test_codes_are_stored_as_small_as_the_environment_writes_them(self, dtype):
+        env = Corridor(N, odd={"observation": MultiCategorical([5, 3], shape=(N, 2), dtype=dtype)})
+        algorithm = build("v3", env)
+        algorithm.observe(collect(algorithm, env, 16)[0])
+        assert algorithm.learners["joint"].sample()["observation"].dtype == dtype
+
+    def test_a_dictionary_instead_of_an_observation_is_refused_by_its_parts(self):
+        parts = Composite({"view": Unbounded(shape=(N, 4)), "words": Categorical(9, shape=(N, 3))}, shape=(N,))
+        message = refusal("v2", Corridor(N, odd={"observation": parts}))
+        assert (
+            "'observation' must be what the agent sees, it is made of several, ['view', 'words']: join them" in message
+        )
 
 
 class TestGymnasium:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import small_env
-from torchrl.data import Binary, Unbounded
+from torchrl.data import Binary, MultiCategorical, Unbounded
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv
 from user_envs import Corridor
 
@@ -120,9 +120,28 @@ def test_a_complete_task_without_players_and_scene_has_two_gaps():
     assert missing(corridor()) == {"no ceiling line", "watch.py shows observations as numbers"}
 
 
+class Locked(Corridor):
+    """Nothing can be done at the ends."""
+
+    def _doors(self):
+        return super()._doors() & super()._doors().all(-1, keepdim=True)
+
+
+class Late(Corridor):
+    """Says what can be done only after the first step."""
+
+    def _reset(self, tensordict, **kwargs):
+        return super()._reset(tensordict, **kwargs).exclude("action_mask")
+
+
 @pytest.mark.parametrize(
     "env, fault",
     [
+        (corridor(Locked, masked=True), "'action_mask' must allow at least one action, at a reset and until"),
+        (
+            corridor(masked=True, odd={"action_mask": Binary(shape=(4, 3))}),
+            r"'action_mask' must be torch.bool \[4, 2\]",
+        ),
         (corridor(Standing), "'attained' must be true only in the step that attains a subgoal"),
         (corridor(task=Task(subgoals=(SubgoalSet(names=("a", "b")),))), "'attained' must be true once in an episode"),
         (corridor(task=Task(subgoals=(SubgoalSet(names=("a",)),))), r"'attained' must be torch.bool \[4, 1\]"),
@@ -165,10 +184,16 @@ def test_a_fault_is_found_and_named(env, fault):
         (Corridor(4), "evaluations need max_steps, v3 needs slice_len"),
         (Corridor(4), "they have no names, and there is no third level"),
         (Corridor(4), "watch.py numbers them"),
+        (Corridor(4, odd={"observation": Unbounded((4, 3), dtype=torch.float64)}), "built-in networks can't read it"),
+        (Corridor(4, odd={"observation": MultiCategorical([5, 3], (4, 2))}), "replay memories are 8 times as large"),
     ],
 )
 def test_a_gap_is_named_with_what_it_costs(env, costs):
     assert costs in missing(env)
+
+
+def test_only_actions_that_can_be_chosen_are_tried():
+    assert wrong(corridor(masked=True)) == []
 
 
 def test_environments_are_checked_through_transforms_and_batches():

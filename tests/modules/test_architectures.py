@@ -2,23 +2,36 @@ import pytest
 import torch
 from helpers import small_env
 from torch import nn
-from torchrl.data import Bounded
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, Unbounded
 
-from hdrqn_torchrl.modules import Architecture, CellsToImage, compact_network, paper_network
-from hdrqn_torchrl.modules.architectures import is_grid
+from hdrqn_torchrl.modules import (
+    Architecture, CellsToImage, compact_network, observation_predictor, paper_network
+)
 
 IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
 
 
-@pytest.fixture(params=["grid", "image", "vector"])
+SPECS = {
+    "cells": small_env(4, view=5).observation_spec["observation"],
+    "image": IMAGE,
+    "small image": Bounded(0, 255, shape=(4, 4, 10, 7), dtype=torch.uint8),
+    "wide image": Unbounded(shape=(4, 1, 36, 84)),
+    "vector": Unbounded(shape=(4, 5)),
+    "flags": Binary(shape=(4, 5), dtype=torch.bool),
+    "codes": MultiCategorical([5, 3, 7], shape=(4, 3), dtype=torch.uint8),
+    "planes": Categorical(6, shape=(4, 2, 5, 5), dtype=torch.uint8),
+    "one code": Categorical(6, shape=(4,)),
+}
+
+
+@pytest.fixture(params=[*SPECS, "size"])
 def inputs(request):
     """A spec (or size), and a batch of two sequences of three inputs for it."""
-    if request.param == "grid":
-        spec = small_env(4, view=5).observation_spec["observation"]
-        return spec, torch.randint(5, (2, 3, 5, 5), dtype=torch.uint8)
-    if request.param == "image":
-        return IMAGE, torch.randint(256, (2, 3, 3, 44, 44), dtype=torch.uint8)
-    return 16, torch.randn(2, 3, 16)
+    if request.param == "size":
+        return 16, torch.randn(2, 3, 16)
+    spec = SPECS[request.param]
+    torch.manual_seed(0)
+    return spec, torch.stack([torch.stack([spec.rand()[0] for _ in range(3)]) for _ in range(2)])
 
 
 @pytest.mark.parametrize("make", [compact_network, paper_network])
@@ -80,8 +93,28 @@ def test_each_network_has_its_own_weights():
     assert not {id(p) for p in first.parameters()} & {id(p) for p in second.parameters()}
 
 
-def test_is_grid_tells_cell_codes_from_images():
-    assert is_grid(small_env().observation_spec["observation"]) and not is_grid(IMAGE)
+@pytest.mark.parametrize("kind", SPECS)
+def test_every_kind_of_observation_is_predicted(kind):
+    torch.manual_seed(0)
+    spec = SPECS[kind]
+    predictor = observation_predictor(spec, 8, 4, 2, width=16)
+    observation = torch.stack([spec.rand() for _ in range(5)], 1)  # [4, 5, ...]
+    memory, action = torch.randn(4, 5, 8), torch.randint(4, (4, 5))
+    error = predictor(memory, action, observation, steps=2)
+    assert error.shape == (4, 3) and error.isfinite().all()
+    error.sum().backward()
+    assert all(each.grad is not None for each in predictor.parameters())
+
+
+def test_small_images_are_predicted_in_full_and_large_ones_coarsely():
+    sizes = [observation_predictor(SPECS[kind], 8, 4, 2).decoder.size for kind in ("small image", "wide image")]
+    assert sizes == [(10, 7), (14, 14)]
+
+
+def test_what_networks_cannot_read_is_not_predicted():
+    spec = Unbounded(shape=(4, 5), dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"prediction_steps must be 0 if .*, got 3 for \[4, 5\]"):
+        observation_predictor(spec, 8, 4, 3)
 
 
 class Summed(nn.Module):

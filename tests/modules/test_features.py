@@ -51,9 +51,37 @@ class TestConvFeatures:
     def test_image_sizes_from_33_pixels_are_accepted(self, size):
         assert ConvFeatures(1, size, 5, channels=(2, 2, 2, 2))(torch.zeros(1, 1, size, size)).shape == (1, 5)
 
-    def test_images_too_small_for_four_convolutions_are_refused(self):
-        with pytest.raises(ValueError, match=r"size must be >= 33, got 32; "):
-            ConvFeatures(size=32)
+    @pytest.mark.parametrize(
+        ("side", "kernels", "strides"),
+        [
+            (84, [5, 3, 3, 3], [2, 2, 2, 1]),
+            (33, [5, 3, 3, 3], [2, 2, 2, 1]),
+            (32, [5, 3, 3, 3], [2, 2, 1, 1]),
+            (20, [5, 3, 3, 3], [2, 1, 1, 1]),
+            (10, [5, 3, 3, 2], [1, 1, 1, 1]),
+            (7, [5, 3, 1, 1], [1, 1, 1, 1]),
+            (1, [1, 1, 1, 1], [1, 1, 1, 1]),
+        ],
+    )
+    def test_convolutions_fit_each_side_of_an_image(self, side, kernels, strides):
+        features = ConvFeatures(2, (44, side), 5, channels=(2, 2, 2, 2))
+        convolutions = [layer for layer in features.convolutions if isinstance(layer, torch.nn.Conv2d)]
+        assert [layer.kernel_size for layer in convolutions] == list(zip([5, 3, 3, 3], kernels, strict=True))
+        assert [layer.stride for layer in convolutions] == list(zip([2, 2, 2, 1], strides, strict=True))
+        assert features(torch.zeros(3, 2, 44, side, dtype=torch.uint8)).shape == (3, 5)
+
+    def test_images_of_any_size_are_read(self):
+        for height in range(1, 36):
+            width = (7 * height) % 41 + 1
+            assert ConvFeatures(1, (height, width), 3, channels=(2, 2, 2, 2))(torch.zeros(1, height, width)).shape == (
+                3,
+            )
+
+    def test_sizes_that_are_no_height_and_width_are_refused(self):
+        with pytest.raises(ValueError, match=r"size must be one number, or height and width, got \(1, 2, 3\); "):
+            ConvFeatures(size=(1, 2, 3))
+        with pytest.raises(ValueError, match=r"size\[1\] must be >= 1, got 0; "):
+            ConvFeatures(size=(1, 0))
 
 
 class TestVectors:

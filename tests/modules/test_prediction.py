@@ -1,34 +1,7 @@
 import pytest
 import torch
-from torch import nn
 
-from hdrqn_torchrl.modules import CellDecoder, ImageDecoder, ObservationPredictor
-from hdrqn_torchrl.modules.prediction import Decoder
-
-
-class TestDecoders:
-    def test_the_cell_decoder_error_is_the_mean_cross_entropy(self):
-        torch.manual_seed(0)
-        decoder = CellDecoder(6, view=3, num_codes=5)
-        vector, cells = torch.randn(2, 4, 6), torch.randint(5, (2, 4, 3, 3), dtype=torch.uint8)
-        logits = decoder.logits(vector).view(-1, 5)
-        expected = nn.functional.cross_entropy(logits, cells.flatten().long(), reduction="none").view(2, 4, 9).mean(-1)
-        torch.testing.assert_close(decoder.error(vector, cells), expected)
-
-    @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-    def test_the_image_decoder_error_is_that_of_the_coarse_image(self, dtype):
-        """An image of four uniform quarters equals its coarse version."""
-        decoder = ImageDecoder(6, channels=2, size=2)
-        quarters = torch.tensor([[0, 51], [102, 255]]).expand(2, 2, 2).clone()
-        image = quarters.repeat_interleave(4, -1).repeat_interleave(4, -2)
-        image = image.to(dtype) if dtype == torch.uint8 else image / 255
-        with torch.no_grad():
-            decoder.pixels.weight.zero_()
-            decoder.pixels.bias.copy_((quarters / 255).flatten())
-            assert decoder.error(torch.randn(3, 6), image.expand(3, 2, 8, 8)).tolist() == pytest.approx([0.0] * 3)
-            decoder.pixels.bias[0] += 0.4
-        error = decoder.error(torch.randn(3, 5, 6), image.expand(3, 5, 2, 8, 8))
-        assert error.shape == (3, 5) and error.flatten().tolist() == pytest.approx([0.16 / 8] * 15)
+from hdrqn_torchrl.modules import CellDecoder, Decoder, ObservationPredictor
 
 
 class Sum(Decoder):

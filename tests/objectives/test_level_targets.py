@@ -41,11 +41,13 @@ class Tables(nn.Module):
         return tuple(table[observation] for table in self.values), observation
 
 
-def make_loss(levels, **settings):
+def make_loss(levels, *, action_mask_key=None, **settings):
     prefixes = list(SETS)[len(SETS) - (levels - 1) :]
     names = [OptionKeys(prefix) for prefix in prefixes]
     loss = AllSubgoalsLoss(
-        AllSubgoalsPolicy(Tables([SETS[prefix] for prefix in prefixes]), subgoal_keys=names),
+        AllSubgoalsPolicy(
+            Tables([SETS[prefix] for prefix in prefixes]), subgoal_keys=names, action_mask_key=action_mask_key
+        ),
         **(SETTINGS | {"wrong_subgoal_reward": [SETTINGS["wrong_subgoal_reward"]] * (levels - 1)} | settings),
     )
     with torch.no_grad():
@@ -114,6 +116,7 @@ class Reference:
 
     def __init__(self, loss, names, td, **settings):
         self.s, self.names, self.td = SETTINGS | settings, names, td
+        self.masked = "action_mask" in td.keys()  # noqa: SIM118
         self.q, self.target = tables(loss)
         self.levels = len(names) + 1
         self.sizes = [ACTIONS, *(SETS[each.prefix] for each in names)]
@@ -127,7 +130,7 @@ class Reference:
 
     def allowed(self, level, b, t):
         if level == 0:
-            return list(range(ACTIONS))
+            return self.td["action_mask"][b, t].nonzero().flatten().tolist() if self.masked else list(range(ACTIONS))
         return self.td[self.names[level - 1].subgoal_mask][b, t].nonzero().flatten().tolist()
 
     def best(self, values, level, c, b, t):
@@ -213,14 +216,18 @@ class Reference:
         }
 
 
+@pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("levels", [1, 2, 3, 4])
 @pytest.mark.parametrize(
     "settings", [{}, {"trace_decay": 0.0}, {"trace_decay": 1.0}, {"double": False}, {"all_subgoals": False}], ids=str
 )
-def test_errors_masks_and_gradients_of_every_level_equal_a_brute_force_reference(levels, settings):
+def test_errors_masks_and_gradients_of_every_level_equal_a_brute_force_reference(levels, settings, masked):
     torch.manual_seed(levels)
-    loss, names = make_loss(levels, **settings)
+    loss, names = make_loss(levels, action_mask_key="action_mask" if masked else None, **settings)
     td = play(loss, names, seed=levels)
+    if masked:
+        taken = td["action"].unsqueeze(-1) == torch.arange(ACTIONS)
+        td["action_mask"] = taken | (torch.rand(B, T, ACTIONS) < 0.5)
     result = loss(td.clone())
     result["loss"].backward()
     reference, total = Reference(loss, names, td, **settings), 0.0
@@ -309,6 +316,23 @@ def test_targets_of_three_levels_equal_numbers_computed_by_hand(actions, events,
         count = sum(y is not None for y in wanted)
         errors = [0.0 if y is None else now - y for now, y in zip(value, wanted, strict=False)]
         gradient = [2 * error / count for error in errors] + [0.0]
+        assert table.grad.sum((1, 2)).tolist() == pytest.approx(gradient, abs=1e-6)
+
+
+def test_targets_count_on_no_action_that_cannot_be_chosen():
+    """As in the row "000" above, but the second step has action 1 only: it is worth 0.2, and greedy as it is alone."""
+    td, names = three_levels("010")
+    td["action_mask"] = torch.tensor([[[True, True], [False, True], [True, True]]])
+    policy = AllSubgoalsPolicy(Tables([1, 1], actions=2, steps=3), subgoal_keys=names, action_mask_key="action_mask")
+    loss = AllSubgoalsLoss(policy, sub_gamma=0.5, meta_gamma=0.5, trace_decay=0.5)
+    main, target = tables(loss)
+    with torch.no_grad():
+        for table, values in zip([*main, *target], ([1.0, 0.0], [0.0], [0.0], [0.8, 0.2], [0.6], [4.0]), strict=True):
+            table.copy_(torch.tensor(values).expand_as(table))
+    loss(td)["loss"].backward()
+    wanted = [[0.5 * (0.5 * 0.2 + 0.5 * 0.4), 0.4], [0.225, 0.3], [1.5, 2.0]]
+    for table, value, targets in zip(main, ([1.0, 0.0], [0.0, 0.0], [0.0, 0.0]), wanted, strict=True):
+        gradient = [now - y for now, y in zip(value, targets, strict=True)] + [0.0]
         assert table.grad.sum((1, 2)).tolist() == pytest.approx(gradient, abs=1e-6)
 
 

@@ -740,3 +740,27 @@ class TestPrediction:
 
 def _init_of(loss, sample):
     return sample[loss.tensor_keys.init].squeeze(-1)
+
+
+@pytest.mark.parametrize(
+    ("settings", "wanted"),
+    [
+        # Actions 0, 0; Q-values (1, 5), (2, 9), (3, 4); the second step has action 0 only; discount 1/2.
+        ({}, [0.5 * 2, 0.5 * 4]),
+        ({"trace_decay": 0.5}, [0.5 * (0.5 * 2 + 0.5 * 2), 2]),  # action 0 is greedy where nothing else is left
+        ({"n_step": 2, "lookahead": 2}, [0.25 * 4]),
+    ],
+    ids=str,
+)
+def test_targets_count_on_no_action_that_cannot_be_chosen(settings, wanted):
+    network = TensorDictModule(nn.Linear(2, 2, bias=False), ["observation"], ["action_value"])
+    nn.init.eye_(network.module.weight)
+    loss = RecurrentDQNLoss(network, **({"gamma": 0.5, "lookahead": 1} | settings))
+    loss.set_keys(action_mask="action_mask")
+    sample = TensorDict(batch_size=[1, 3])
+    sample["observation"] = torch.tensor([[[1.0, 5.0], [2.0, 9.0], [3.0, 4.0]]])
+    sample["action_mask"] = torch.tensor([[[True, True], [True, False], [True, True]]])
+    sample["action"], sample["next", "reward"] = torch.zeros(1, 3, dtype=torch.int64), torch.zeros(1, 3, 1)
+    for key in ("is_init", ("next", "done"), ("next", "terminated")):
+        sample[key] = torch.zeros(1, 3, 1, dtype=torch.bool)
+    assert loss(sample)["target"].item() == pytest.approx(sum(wanted) / len(wanted))
