@@ -15,9 +15,9 @@ _LARGEST_FLOAT = 10.0  # images in float32 with bounds above this are not taken 
 _MOST_CODES = 1_000_000  # of all entries of a vector of bounded integers; it has as many rows of weights
 _MOST_COLOURS = 4  # an image whose last dimension is no larger has its channels there
 READABLE = (
-    "a square of cell codes [V, V] (Categorical, integers), other codes (MultiCategorical, Categorical, or a Bounded "
-    "vector of integers from 0), "
-    "an image [channels, height, width] (uint8, or float32 of about 1) or a vector [D] (float32)"
+    "a square of cell codes [V, V] (Categorical, integers), other codes (a Bounded vector of integers from 0, "
+    "Categorical or MultiCategorical), an image [channels, height, width] (uint8, or float32 of about 1) or a vector "
+    "[D] (float32)"
 )
 
 
@@ -33,7 +33,9 @@ def observation_kind(spec: TensorSpec, shape: Sequence[int]) -> ObservationKind 
         ``"image"``, ``"vector"``; ``None``: none of these.
 
     Examples:
-        >>> observation_kind(MultiCategorical([5, 3], shape=(8, 2)), [2])
+        >>> observation_kind(Categorical(5, shape=(8, 3, 3)), [3, 3])
+        'cells'
+        >>> observation_kind(Bounded(0, torch.tensor([4, 2]).expand(8, 2), shape=(8, 2), dtype=torch.uint8), [2])
         'codes'
         >>> observation_kind(Bounded(0, 255, shape=(8, 3, 44, 60), dtype=torch.uint8), [3, 44, 60])
         'image'
@@ -121,7 +123,5 @@ def _remedy(spec: TensorSpec, shape: Sequence[int]) -> str:
             "give an image a dimension for its channels with UnsqueezeTransform, make a vector of others by flattening"
         )
     if not spec.dtype.is_floating_point:
-        return (
-            "cast it to float32 if its numbers are quantities; if they are codes, number them from 0 (MultiCategorical)"
-        )
+        return "cast it to float32 if it holds quantities; number codes from 0, with bounds for each entry (Bounded)"
     return "flatten it, or cast it to float32"

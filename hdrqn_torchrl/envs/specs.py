@@ -5,11 +5,11 @@ from __future__ import annotations
 from itertools import groupby
 
 import torch
-from torchrl.data import Binary, Categorical, Composite, MultiCategorical, TensorSpec, Unbounded
+from torchrl.data import Binary, Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.envs.observations import code_sizes
+from hdrqn_torchrl.envs.observations import code_sizes, observation_kind
 
 
 def check_is_environment(env: EnvBase) -> None:
@@ -32,6 +32,7 @@ def interface(env: EnvBase) -> dict[str, str]:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
         >>> interface(MultiGoalGridEnv(4, view=5))["action"]
         'int64 [] below 4'
+        >>> from torchrl.data import MultiCategorical
         >>> _in_words(MultiCategorical([5, 5, 3], shape=(4, 3), dtype=torch.uint8), [3])
         'uint8 [3] below 5 (2 times), 3'
     """
@@ -45,7 +46,7 @@ def interface(env: EnvBase) -> dict[str, str]:
 
 def _in_words(spec: TensorSpec, shape: list[int]) -> str:
     below = ""
-    if isinstance(spec, MultiCategorical):
+    if type(spec) is not Categorical and observation_kind(spec, shape) == "codes":
         runs = [(size, len(list(run))) for size, run in groupby(code_sizes(spec, shape))]
         below = " below " + ", ".join(f"{size} ({times} times)" if times > 1 else f"{size}" for size, times in runs)
     elif type(spec) is Categorical:  # not of flags

@@ -2,8 +2,10 @@ import pytest
 import torch
 from helpers import small_env
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, OneHot, Unbounded
+from user_envs import Corridor
 
 from hdrqn_torchrl.envs.observations import code_sizes, observation_kind, observation_problem
+from hdrqn_torchrl.envs.specs import interface, interface_differences
 
 N = 4
 
@@ -40,9 +42,9 @@ def test_what_built_in_networks_take_an_observation_for(spec, kind):
     ("spec", "remedy"),
     [
         (Unbounded(shape=(N, 4), dtype=torch.float64), "cast it to float32, for instance with DoubleToFloat"),
-        (Unbounded(shape=(N, 4), dtype=torch.int64), "if they are codes, number them from 0"),
-        (Bounded(-3, 3, shape=(N, 4), dtype=torch.int64), "cast it to float32 if its numbers are quantities"),
-        (Bounded(0, 2**30, shape=(N, 4), dtype=torch.int64), "cast it to float32 if its numbers are quantities"),
+        (Unbounded(shape=(N, 4), dtype=torch.int64), "number codes from 0, with bounds for each entry"),
+        (Bounded(-3, 3, shape=(N, 4), dtype=torch.int64), "cast it to float32 if it holds quantities"),
+        (Bounded(0, 2**30, shape=(N, 4), dtype=torch.int64), "cast it to float32 if it holds quantities"),
         (Bounded(0, 255, shape=(N, 44, 44), dtype=torch.uint8), "UnsqueezeTransform"),
         (Bounded(0, 255, shape=(N, 44, 60, 3), dtype=torch.uint8), "put the channels first"),
         (Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.float32), "divide it by its largest value"),
@@ -71,3 +73,14 @@ def test_what_to_do_about_observations_that_cannot_be_read(spec, remedy):
 )
 def test_every_entry_has_its_own_number_of_codes(spec, sizes):
     assert code_sizes(spec, spec.shape[1:]) == sizes
+
+
+def test_agents_for_other_numbers_of_codes_are_told_apart():
+    def corridor(*highs):
+        high = torch.tensor(highs).expand(N, len(highs))
+        return Corridor(N, odd={"observation": Bounded(0, high, shape=high.shape, dtype=torch.uint8)})
+
+    assert interface(corridor(4, 4, 2))["observation"] == "uint8 [3] below 5 (2 times), 3"
+    assert interface_differences(corridor(4, 4, 2), corridor(4, 3, 2)) == (
+        "observation is uint8 [3] below 5, 4, 3 instead of uint8 [3] below 5 (2 times), 3"
+    )

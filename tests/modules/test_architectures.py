@@ -4,9 +4,7 @@ from helpers import small_env
 from torch import nn
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, Unbounded
 
-from hdrqn_torchrl.modules import (
-    Architecture, CellsToImage, compact_network, observation_predictor, paper_network
-)
+from hdrqn_torchrl.modules import Architecture, CellsToImage, compact_network, observation_predictor, paper_network
 
 IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
 
