@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 import hdrqn_torchrl
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.settings import RunSettings, settings_of
+from hdrqn_torchrl.runs.trust import imports_of
 
 ConfigStore.instance().store(name="schema", node=RunSettings)
 _PACKAGE = Path(hdrqn_torchrl.__file__).parent
@@ -43,4 +45,6 @@ def resolved(config: DictConfig) -> RunSettings:
     Raises:
         SettingsError: as :func:`plain`, or if a setting is unknown or of another type.
     """
-    return settings_of(plain(config))
+    settings = settings_of(plain(config))
+    own = imports_of(settings.env)  # named on the user's own command line, or in a file of theirs
+    return replace(settings, allowed_targets=list(dict.fromkeys([*settings.allowed_targets, *own])))

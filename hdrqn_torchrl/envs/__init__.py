@@ -12,6 +12,9 @@ from hdrqn_torchrl.envs.grid.scripted import (
     play_episodes,
     scripted_ceiling,
 )
+from hdrqn_torchrl.envs.gym.making import make_gym
+from hdrqn_torchrl.envs.gym.minigrid.making import make_minigrid
+from hdrqn_torchrl.envs.gym.subgoals import Subgoals
 from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv
 from hdrqn_torchrl.envs.montezuma.making import make_montezuma
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
@@ -26,10 +29,13 @@ __all__ = [
     "PerfectMemorySearch",
     "Reference",
     "SubgoalSet",
+    "Subgoals",
     "Task",
     "UniformRandom",
     "ceiling",
     "check_task",
+    "make_gym",
+    "make_minigrid",
     "make_montezuma",
     "play_episodes",
     "scripted_ceiling",

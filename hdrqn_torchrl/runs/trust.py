@@ -9,12 +9,15 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from hdrqn_torchrl.envs.gym.making import PACKAGES
 from hdrqn_torchrl.runs.arguments import TARGET, Settings, SettingsError
 from hdrqn_torchrl.runs.stored_settings import check_plain
 
 BUILDERS = {
     "env": (
         "hdrqn_torchrl.envs.MultiGoalGridEnv",
+        "hdrqn_torchrl.envs.make_gym",
+        "hdrqn_torchrl.envs.make_minigrid",
         "hdrqn_torchrl.envs.make_montezuma",
     ),
     "algo": (
@@ -44,6 +47,7 @@ BUILDERS = {
 """What a ``_target_`` may name, by its place; a user's own are added with ``allowed_targets=[package.builder]``."""
 
 ALLOWED_TARGETS = tuple(target for targets in BUILDERS.values() for target in targets)
+_MAKES_GYM = ("hdrqn_torchrl.envs.make_gym", "hdrqn_torchrl.envs.make_minigrid")
 _LOGGER = re.compile(r"logger\.loggers\[\d+\]")
 _MARKS = {"_recursive_": (False,), "_convert_": ("all",)}  # of Hydra, as the files of conf/ use them: for loggers
 
@@ -92,10 +96,39 @@ def check_targets(settings: Any, allowed: Sequence[str], place: str = "") -> Non
                 f"{path}._target_ must be one of the builders that this program trusts there, got {target!r}. If you "
                 f"wrote this setting and trust it, add 'allowed_targets=[{target}]' to the command."
             )
+        for name in imports_of(node):
+            if name not in allowed:
+                raise SettingsError(
+                    f"{path} must import nothing that this program does not trust, got {name!r}. If you wrote this "
+                    f"setting and trust it, add 'allowed_targets=[{name}]' to the command."
+                )
         for key in node:
             may = (target in allowed or _LOGGER.fullmatch(path)) and node[key] in _MARKS.get(key, ())
             if key.startswith("_") and key != TARGET and not may:
                 raise SettingsError(f"{path}.{key} must be left out, got {node[key]!r}; name settings one by one.")
+
+
+def imports_of(settings: Settings) -> list[str]:
+    """Names of a user's own that an environment of Gymnasium imports: subgoals, rules, wrappers, packages.
+
+    Args:
+        settings: of one environment, with their ``_target_``.
+
+    Examples:
+        >>> gym = {"_target_": "hdrqn_torchrl.envs.make_gym", "id": "mine:Maze-v0", "subgoals": "mine.Doors"}
+        >>> imports_of(gym)
+        ['mine.Doors', 'mine']
+    """
+    if settings.get(TARGET) not in _MAKES_GYM:
+        return []
+    found: list[str] = []
+    for key in ("subgoals", "wrappers", "reward", "success", "hazard"):
+        value = settings.get(key)
+        found += [
+            each for each in (value if isinstance(value, list) else [value]) if isinstance(each, str) and "." in each
+        ]
+    package, module = settings.get("package"), str(settings.get("id", "")).rpartition(":")[0]
+    return found + [each for each in (package, module) if each and each not in PACKAGES.values()]
 
 
 def _nodes(settings: Any, path: str) -> Iterator[tuple[str, Settings]]:

@@ -1,0 +1,366 @@
+"""Any Gymnasium environment with discrete actions as a task for all agents."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import pkgutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import partial
+from typing import Any, Literal
+
+import gymnasium
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.wrappers import TimeLimit
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
+from hdrqn_torchrl.envs.gym.observations import make_encoder
+from hdrqn_torchrl.envs.gym.subgoals import Subgoals
+from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
+from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper
+from hdrqn_torchrl.envs.task import Task
+
+PACKAGES = {
+    "ALE/": "ale_py",
+    "MiniGrid-": "minigrid",
+    "BabyAI-": "minigrid",
+    "popgym-": "popgym",
+    "Vizdoom": "vizdoom.gymnasium_wrapper",
+    "hdrqn/": "hdrqn_torchrl.envs.gym",
+}
+"""Packages that register environments, by how the ids begin. They are imported for these ids."""
+
+EnvFactory = Callable[[], gymnasium.Env]
+SomeSubgoals = Subgoals | str | Sequence[Subgoals | str] | None
+
+
+def make_gym(
+    id: str | EnvFactory | VectorEnv,
+    num_envs: int = 16,
+    *,
+    subgoals: SomeSubgoals = None,
+    settings: Mapping[str, Any] | None = None,
+    package: str | None = None,
+    wrappers: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str] = (),
+    entries: Sequence[str] | None = None,
+    codes: int | Sequence[int] | None = None,
+    words: Sequence[str] | None = None,
+    text_length: int = 16,
+    actions: Sequence[int] | None = None,
+    reward: str | Rule | None = None,
+    success: str | Rule | None = None,
+    hazard: str | Rule | None = None,
+    max_steps: int | None = None,
+    largest_return: float | None = None,
+    smallest_return: float | None = None,
+    backend: Literal["gymnasium", "envpool"] = "gymnasium",
+    processes: bool = False,
+    seed: int | None = None,
+    device: torch.device | str | None = None,
+) -> GymTaskEnv:
+    """N worlds of a Gymnasium environment, with the project's entries.
+
+    What it shows becomes one tensor (:func:`~hdrqn_torchrl.envs.gym.make_encoder` says how). Episodes that terminate
+    are ``terminated``, those that a time limit ends are ``truncated``. Every episode has a seed of its own, drawn from
+    ``seed``, so that a resumed training can play it again up to where it was.
+
+    Strings that name something of a package (``"my_package.DoorSubgoals"``) are for settings: they are imported.
+
+    Args:
+        id: of a registered environment; or a function that makes one world; or a vector of worlds made elsewhere.
+        num_envs: N.
+        subgoals: a set of subgoals, or several from near to far; ``None``: agents of one level only.
+        settings: keyword arguments for ``gymnasium.make``.
+        package: that registers the id when it is imported, if it is none of :data:`PACKAGES`.
+        wrappers: put around every world, the first one innermost.
+        entries, codes, words, text_length: of observations; see :func:`~hdrqn_torchrl.envs.gym.make_encoder`.
+        actions: numbers of the actions that the agent has; ``None``: all.
+        reward: in place of the environment's own: an entry of ``info``, or a function of (reward, info).
+        success: whether a step completed the task, likewise; the function's ``info`` also has ``reward``,
+            ``terminated`` and ``truncated``.
+        hazard: what is to be avoided, likewise.
+        max_steps: episodes are cut off then; ``None``: where the environment's own limit is.
+        largest_return: of an episode, if known: it bounds the targets.
+        smallest_return: likewise.
+        backend: ``"envpool"`` steps the worlds in C++, if it has the id: ``pip install 'hdrqn_torchrl[envpool]'``. Its
+            worlds can't be looked into, and a resumed training begins new episodes.
+        processes: each world has a process of its own.
+        seed: of all episodes; ``None`` draws one from torch's global generator.
+        device: device of all tensors.
+
+    Raises:
+        ImportError: if a package is missing.
+        ValueError: if there is no such environment, it cannot be made, or an argument breaks its rule.
+
+    Examples:
+        >>> env = make_gym("CartPole-v1", num_envs=4, seed=0)
+        >>> env.rollout(3)["observation"].shape
+        torch.Size([4, 3, 4])
+    """
+    if isinstance(num_envs, bool) or num_envs < 1:
+        raise ValueError(f"num_envs must be >= 1, got {num_envs}; use 16 for training on one core.")
+    read = partial(
+        _read,
+        actions=actions,
+        options={"entries": entries, "codes": codes, "words": words, "text_length": text_length},
+        rest={
+            "subgoals": _subgoals(subgoals),
+            **{key: _rule(key, rule) for key, rule in (("reward", reward), ("success", success), ("hazard", hazard))},
+        },
+    )
+    if isinstance(id, VectorEnv):
+        made = _given(id, num_envs, read)
+    elif backend == "envpool":
+        made = _pooled(id, num_envs, read, {**(settings or {}), **_limit(max_steps)})
+    elif backend == "gymnasium":
+        made = _own(
+            _factory(id, settings, package, _wrappers(wrappers), max_steps), num_envs, read, processes=processes
+        )
+    else:
+        raise ValueError(f"backend must be 'gymnasium' or 'envpool', got {backend!r}.")
+    largest, smallest = (math.inf if largest_return is None else largest_return), smallest_return
+    task = Task(
+        max_steps=max_steps or made.max_steps,
+        largest_return=largest,
+        largest_extrinsic_return=largest,
+        smallest_extrinsic_return=-math.inf if smallest is None else smallest,
+        subgoals=tuple(each.stated for each in made.reading.subgoals),
+        actions=made.action_names,
+    )
+    return GymTaskEnv(
+        made.worlds, num_envs=num_envs, actions=made.actions, reading=made.reading, task=task, render=made.render,
+        seed=seed, device=device,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Made:
+    """Worlds, and what was learned of them when they were made."""
+
+    worlds: Worlds
+    reading: Reading
+    actions: tuple[int, ...]
+    action_names: tuple[str, ...] = ()
+    max_steps: int | None = None
+    render: Callable[[], Any] | None = None
+
+
+def _read(
+    observed: spaces.Space,
+    acted: spaces.Space,
+    *,
+    masked: bool,
+    actions: Sequence[int] | None,
+    options: Mapping[str, Any],
+    rest: Mapping[str, Any],
+) -> tuple[Reading, tuple[int, ...]]:
+    """How entries are read, and the numbers of the agent's actions, for the spaces of one world."""
+    numbers = _actions(acted, actions)
+    return Reading(encoder=make_encoder(observed, **options), masked_actions=numbers if masked else (), **rest), numbers
+
+
+def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, processes: bool) -> _Made:
+    """A vector of worlds that are made here."""
+    probe = make()
+    try:
+        _, info = probe.reset(seed=0)
+        reading, actions = read(probe.observation_space, probe.action_space, masked=keys.ACTION_MASK in info)
+        names, limit = _action_names(probe, actions), _time_limit(probe)
+        modes = probe.metadata.get("render_modes") or ()
+    finally:
+        probe.close()
+    first = {"render_mode": "rgb_array"} if "rgb_array" in modes else {}
+    worlds = [partial(_world, make, reading, first if index == 0 else {}) for index in range(num_envs)]
+    vector: SyncVectorEnv | AsyncVectorEnv
+    if processes:
+        vector = AsyncVectorEnv(worlds, autoreset_mode=AutoresetMode.DISABLED)
+    else:
+        vector = SyncVectorEnv(worlds, copy=False, autoreset_mode=AutoresetMode.DISABLED)
+    return _Made(
+        worlds=OwnWorlds(vector), reading=reading, actions=actions, action_names=names, max_steps=limit,
+        render=partial(_picture, vector),
+    )  # fmt: skip
+
+
+def _world(make: Callable[..., gymnasium.Env], reading: Reading, settings: Mapping[str, Any]) -> gymnasium.Env:
+    return WorldWrapper(make(**settings), reading)
+
+
+def _picture(vector: SyncVectorEnv | AsyncVectorEnv) -> Any:
+    """Of the first world, if it makes any."""
+    first = vector.envs[0] if isinstance(vector, SyncVectorEnv) else None
+    if first is not None:
+        return first.render() if first.render_mode else None
+    return vector.call("render")[0] if vector.get_attr("render_mode")[0] else None
+
+
+def _factory(
+    id: str | EnvFactory,
+    settings: Mapping[str, Any] | None,
+    package: str | None,
+    wrappers: Sequence[Callable[[gymnasium.Env], gymnasium.Env]],
+    max_steps: int | None,
+) -> Callable[..., gymnasium.Env]:
+    """A function that makes one world; it takes more settings for ``gymnasium.make``."""
+    if isinstance(id, str):
+        import_package_of(id, package)
+        make = partial(_registered, id, dict(settings or {}), max_steps)
+    elif settings or package:
+        raise ValueError(
+            f"settings and package must be left out with a function that makes worlds, got {settings}, {package!r}."
+        )
+    else:
+        make = partial(_limited, id, max_steps)
+    return partial(_wrapped, make, tuple(wrappers))
+
+
+def _registered(id: str, settings: Mapping[str, Any], max_steps: int | None, **more: Any) -> gymnasium.Env:
+    try:
+        return gymnasium.make(id, **{**settings, **more}, **_limit(max_steps))
+    except gymnasium.error.Error as error:
+        raise ValueError(f"id must be that of an environment that Gymnasium knows, got {id!r} ({error}).") from error
+    except TypeError as error:
+        raise ValueError(f"settings must be arguments that {id} takes, got {sorted(settings)} ({error}).") from error
+
+
+def _limited(make: EnvFactory, max_steps: int | None, **_: Any) -> gymnasium.Env:
+    env = make()
+    return env if max_steps is None else TimeLimit(env, max_steps)
+
+
+def _wrapped(make: Callable[..., gymnasium.Env], wrappers: Iterable[Callable], **settings: Any) -> gymnasium.Env:
+    env = make(**settings)
+    for wrapper in wrappers:
+        env = wrapper(env)
+    return env
+
+
+def _given(vector: VectorEnv, num_envs: int, read: Callable) -> _Made:
+    """A vector that was made elsewhere."""
+    if vector.num_envs != num_envs:
+        raise ValueError(f"num_envs must be that of the vector, {vector.num_envs}, got {num_envs}.")
+    masked = keys.ACTION_MASK in vector.reset(seed=0)[1]
+    reading, actions = read(vector.single_observation_space, vector.single_action_space, masked=masked)
+    limit = getattr(vector.spec, "max_episode_steps", None)
+    return _Made(worlds=GivenWorlds(vector, reading), reading=reading, actions=actions, max_steps=limit)
+
+
+def _pooled(id: str | EnvFactory, num_envs: int, read: Callable, settings: Mapping[str, Any]) -> _Made:
+    """Worlds of EnvPool."""
+    try:
+        import envpool
+    except ImportError as error:
+        raise ImportError("backend='envpool' needs EnvPool: pip install 'hdrqn_torchrl[envpool]'.") from error
+    if not isinstance(id, str) or id not in envpool.list_all_envs():
+        raise ValueError(f"id must be one that EnvPool has, got {id!r}; use backend='gymnasium'.")
+    make = partial(_pool, id, num_envs, dict(settings))
+    pool = make(0)
+    reading, actions = read(pool.observation_space, pool.action_space, masked=False)
+    limit = pool.spec.config.max_episode_steps
+    worlds = PooledWorlds(make, pool, reading, num_envs)
+    return _Made(worlds=worlds, reading=reading, actions=actions, max_steps=limit if 0 < limit < 2**31 - 1 else None)
+
+
+def _pool(id: str, num_envs: int, settings: Mapping[str, Any], seed: int) -> Any:
+    import envpool
+
+    return envpool.make(id, env_type="gymnasium", num_envs=num_envs, seed=seed, **settings)
+
+
+def _limit(max_steps: int | None) -> dict[str, Any]:
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None: the environment's own limit.")
+    return {} if max_steps is None else {"max_episode_steps": max_steps}
+
+
+def _time_limit(env: gymnasium.Env) -> int | None:
+    """The shortest one among an environment's wrappers."""
+    limits = [env._max_episode_steps] if isinstance(env, TimeLimit) else []
+    if isinstance(env, gymnasium.Wrapper):
+        limits += [_time_limit(env.env) or 0]
+    return min((limit for limit in limits if limit), default=None)
+
+
+def _actions(space: spaces.Space, chosen: Sequence[int] | None) -> tuple[int, ...]:
+    """The environment's numbers of the agent's actions."""
+    if not isinstance(space, spaces.Discrete):
+        raise ValueError(
+            f"id must be an environment with one discrete action, got {space}; number the combinations of its parts, "
+            "or choose some, with a wrapper (gymnasium.wrappers.TransformAction)."
+        )
+    all_of_them = range(int(space.start), int(space.start + space.n))
+    if chosen is None:
+        return tuple(all_of_them)
+    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(all_of_them):
+        raise ValueError(f"actions must be different numbers in {list(all_of_them)}, got {list(chosen)}.")
+    return tuple(chosen)
+
+
+def _action_names(env: gymnasium.Env, actions: Sequence[int]) -> tuple[str, ...]:
+    """As ALE's environments and MiniGrid's tell them; empty if the environment does not."""
+    meanings = getattr(env.unwrapped, "get_action_meanings", None)
+    if callable(meanings):
+        return tuple(str(meanings()[action]).lower() for action in actions)
+    named = getattr(env.unwrapped, "actions", None)
+    if isinstance(named, type) and issubclass(named, IntEnum):
+        return tuple(named(action).name for action in actions)
+    return ()
+
+
+def _subgoals(given: SomeSubgoals) -> tuple[Subgoals, ...]:
+    """All sets, from near to far; names are looked up, classes are made."""
+    sets = [] if given is None else list(given) if isinstance(given, list | tuple) else [given]
+    found = [_named("subgoals", each) for each in sets]
+    made = tuple(each() if isinstance(each, type) else each for each in found)
+    for each in made:
+        if not callable(getattr(each, "conditions", None)) or not getattr(each, "names", None):
+            raise ValueError(
+                f"subgoals must have names and a method conditions, got {each!r}; derive a class from "
+                "hdrqn_torchrl.envs.gym.Subgoals."
+            )
+    prefixes = [each.prefix for each in made]
+    if made and (len(set(prefixes)) < len(made) or prefixes[-1]):
+        raise ValueError(f"subgoals must have different prefixes, and the last, farthest set none, got {prefixes}.")
+    return made
+
+
+def _rule(name: str, rule: str | Rule | None) -> str | Rule | None:
+    """A function, or the name of an entry of ``info``; names with dots are those of functions."""
+    return _named(name, rule) if isinstance(rule, str) and "." in rule else rule
+
+
+def _wrappers(given: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str]) -> list[Callable]:
+    return [_named("wrappers", each) for each in given]
+
+
+def _named(argument: str, value: Any) -> Any:
+    """What a string names; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return pkgutil.resolve_name(value)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{argument} must name something that can be imported, got {value!r} ({error}).") from error
+
+
+def import_package_of(id: str, package: str | None = None) -> None:
+    """Imports the package that registers an id.
+
+    Args:
+        id: of an environment.
+        package: its package; ``None``: as :data:`PACKAGES` says, which is none for environments of Gymnasium itself.
+
+    Raises:
+        ImportError: if it is missing.
+    """
+    known = [each for start, each in PACKAGES.items() if id.startswith(start)]
+    for name in [package] if package else known:
+        try:
+            gymnasium.register_envs(importlib.import_module(name))
+        except ImportError as error:
+            raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it.") from error

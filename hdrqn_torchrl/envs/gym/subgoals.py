@@ -1,0 +1,126 @@
+"""Subgoals of a Gymnasium environment: what a user says about them, and what becomes of it in each step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from hdrqn_torchrl.envs.task import SubgoalSet
+
+Flags = NDArray[np.bool_]
+
+
+class Subgoals:
+    """A set of subgoals of a Gymnasium environment, for subclasses to fill in.
+
+    A subgoal is attained in the step in which its condition becomes true, whichever one the agent pursues.
+
+    Attributes:
+        names: of the subgoals.
+        prefix: of their entries; empty for the farthest set, the only one that agents of two levels pursue.
+        repeatable: whether a subgoal can be attained more than once in an episode; one answer for each, or for all.
+
+    Every world has a copy of its own, so that a set may keep something from step to step.
+
+    Examples:
+        A key to pick up, then a door to open, in MiniGrid's DoorKey:
+
+        >>> class KeyAndDoor(Subgoals):
+        ...     names = ("key", "door")
+        ...
+        ...     def conditions(self, env, before, after, info):
+        ...         world = env.unwrapped
+        ...         doors = [each for each in world.grid.grid if each is not None and each.type == "door"]
+        ...         return world.carrying is not None, doors[0].is_open
+        >>> len(KeyAndDoor().names)
+        2
+    """
+
+    names: Sequence[str] = ()
+    prefix: str = ""
+    repeatable: bool | Sequence[bool] = False
+
+    def conditions(self, env: gymnasium.Env | None, before: Any, after: Any, info: Mapping[str, Any]) -> Sequence[bool]:
+        """Which subgoals' conditions hold after a step, in the order of their names.
+
+        Args:
+            env: one world; ``None`` where worlds cannot be looked into (EnvPool, vectors that were not made here).
+            before: the observation before the step, as the environment returned it; ``None`` at a reset.
+            after: the observation after it.
+            info: as returned with it. After a step it also has ``reward``, ``terminated`` and ``truncated``, unless the
+                environment writes entries of these names itself.
+        """
+        raise NotImplementedError(f"{type(self).__name__} must say which subgoals hold: define conditions(...).")
+
+    def available(self, env: gymnasium.Env | None, attained: Flags) -> Sequence[bool] | Flags:
+        """Which subgoals are worth choosing now.
+
+        Args:
+            env: as in :meth:`conditions`.
+            attained: which ones were attained in this episode.
+
+        Returns:
+            By default those that can still be attained.
+        """
+        return ~attained | np.asarray(self.repeatable, np.bool_)
+
+    @property
+    def stated(self) -> SubgoalSet:
+        """As a task states it."""
+        return SubgoalSet(names=tuple(self.names), prefix=self.prefix, repeatable=bool(np.any(self.repeatable)))
+
+
+class SubgoalRecord:
+    """What one world has attained in the episode in progress.
+
+    Args:
+        subgoals: one set.
+        env: the world; ``None`` if it cannot be looked into.
+    """
+
+    def __init__(self, subgoals: Subgoals, env: gymnasium.Env | None) -> None:
+        self.subgoals, self.env = deepcopy(subgoals), env
+        self._held = self._attained = np.zeros(len(subgoals.names), np.bool_)
+        self._keys = subgoals.stated.keys
+
+    def begin(self, observation: Any, info: Mapping[str, Any]) -> dict[str, Flags]:
+        """Entries at the start of an episode: what holds already is not attained."""
+        self._held = self._conditions(None, observation, info)
+        self._attained = np.zeros_like(self._held)
+        return self._entries(np.zeros_like(self._held))
+
+    def step(self, before: Any, after: Any, info: Mapping[str, Any]) -> dict[str, Flags]:
+        """Entries after a step."""
+        holds = self._conditions(before, after, info)
+        attained = holds & ~self._held & (~self._attained | np.asarray(self.subgoals.repeatable, np.bool_))
+        self._held, self._attained = holds, self._attained | attained
+        return self._entries(attained)
+
+    def state_dict(self) -> dict[str, list[bool]]:
+        """What holds and what was attained, as plain data."""
+        return {"held": self._held.tolist(), "attained": self._attained.tolist()}
+
+    def load_state_dict(self, state: Mapping[str, Sequence[bool]]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self._held, self._attained = (np.asarray(state[name], np.bool_) for name in ("held", "attained"))
+
+    def _conditions(self, before: Any, after: Any, info: Mapping[str, Any]) -> Flags:
+        return self._flags("conditions", self.subgoals.conditions(self.env, before, after, info))
+
+    def _entries(self, attained: Flags) -> dict[str, Flags]:
+        available = self._flags("available", self.subgoals.available(self.env, self._attained))
+        return {self._keys.attained: attained, self._keys.available: available}
+
+    def _flags(self, method: str, found: Sequence[bool] | Flags) -> Flags:
+        flags = np.asarray(found, np.bool_)
+        if flags.shape != self._held.shape:
+            raise ValueError(
+                f"subgoals.{method} must return a truth value for each of the {len(self._held)} names "
+                f"{list(self.subgoals.names)}, got {found!r}."
+            )
+        return flags

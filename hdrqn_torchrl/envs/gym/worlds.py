@@ -1,0 +1,226 @@
+"""One world of a Gymnasium environment as agents see it: what it shows, its subgoals, its success."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from numpy.typing import NDArray
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs.gym.observations import Encoder
+from hdrqn_torchrl.envs.gym.subgoals import SubgoalRecord, Subgoals
+
+Entries = dict[str, NDArray]
+_BOOL: Any = np.bool_  # which Gymnasium's annotations leave out
+Rule = Callable[[float, Mapping[str, Any]], float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reading:
+    """How the entries of a step are read from what a Gymnasium environment returns.
+
+    Args:
+        encoder: of observations.
+        subgoals: sets of subgoals, from near to far.
+        success: name of an entry of ``info``, or a function of (reward, info); ``None``: nothing is known of it.
+        hazard: the same for what is to be avoided.
+        reward: the same for a reward in place of the environment's own.
+        masked_actions: numbers of the agent's actions, if ``info["action_mask"]`` tells which ones of the environment's
+            can be chosen; empty if it does not.
+    """
+
+    encoder: Encoder
+    subgoals: tuple[Subgoals, ...] = ()
+    success: str | Rule | None = None
+    hazard: str | Rule | None = None
+    reward: str | Rule | None = None
+    masked_actions: tuple[int, ...] = ()
+
+    @cached_property
+    def space(self) -> spaces.Dict:
+        """Of the entries of one world."""
+        sizes = {
+            each.stated.keys.of(key): len(each.names) for each in self.subgoals for key in ("attained", "available")
+        }
+        sizes |= {
+            key: 1 for key, rule in ((keys.SUCCESS, self.success), (keys.HAZARD, self.hazard)) if rule is not None
+        }
+        sizes |= {keys.ACTION_MASK: len(self.masked_actions)} if self.masked_actions else {}
+        flags = {key: spaces.Box(0, 1, (size,), _BOOL) for key, size in sizes.items()}
+        return spaces.Dict({keys.OBSERVATION: self.encoder.space, **flags})
+
+
+class World:
+    """The entries of one world, step by step.
+
+    Args:
+        reading: how they are read.
+        env: the world; ``None`` if it cannot be looked into.
+    """
+
+    def __init__(self, reading: Reading, env: gymnasium.Env | None = None) -> None:
+        self.reading = reading
+        self._records = [SubgoalRecord(each, env) for each in reading.subgoals]
+        self.shown: Any = None
+        """The last observation, as the environment returned it."""
+
+    def begin(self, observation: Any, info: Mapping[str, Any]) -> Entries:
+        """Entries at the start of an episode."""
+        self.shown = observation
+        entries = self._entries(observation, info)
+        for record in self._records:
+            entries |= record.begin(observation, info)
+        no = np.zeros(1, np.bool_)
+        return entries | {key: no for key in (keys.SUCCESS, keys.HAZARD) if key in self.reading.space.spaces}
+
+    def step(
+        self, observation: Any, reward: float, terminated: bool, truncated: bool, info: Mapping[str, Any]
+    ) -> tuple[Entries, float]:
+        """Entries after a step, and its reward."""
+        told = {"reward": reward, "terminated": terminated, "truncated": truncated, **info}
+        entries = self._entries(observation, info)
+        for record in self._records:
+            entries |= record.step(self.shown, observation, told)
+        self.shown = observation
+        for key, rule in ((keys.SUCCESS, self.reading.success), (keys.HAZARD, self.reading.hazard)):
+            if rule is not None:
+                entries[key] = np.array([bool(_applied(rule, reward, told, key))])
+        rule = self.reading.reward
+        return entries, reward if rule is None else float(_applied(rule, reward, told, "reward"))
+
+    def subgoals_state(self) -> list[dict[str, list[bool]]]:
+        """What was attained so far, as plain data."""
+        return [record.state_dict() for record in self._records]
+
+    def go_on(self, shown: Any, subgoals: Sequence[Mapping[str, list[bool]]]) -> Entries:
+        """Goes on in the middle of an episode that was left with this observation and :meth:`subgoals_state`."""
+        self.shown = shown
+        for record, state in zip(self._records, subgoals, strict=True):
+            record.load_state_dict(state)
+        return {keys.OBSERVATION: self.reading.encoder.encode(shown)}
+
+    def _entries(self, observation: Any, info: Mapping[str, Any]) -> Entries:
+        entries: Entries = {keys.OBSERVATION: self.reading.encoder.encode(observation)}
+        if self.reading.masked_actions:
+            entries[keys.ACTION_MASK] = _action_mask(info, self.reading.masked_actions)
+        return entries
+
+
+def _applied(rule: str | Rule, reward: float, info: Mapping[str, Any], name: str) -> Any:
+    if not isinstance(rule, str):
+        return rule(reward, info)
+    if rule not in info:
+        raise ValueError(f"{name} must name an entry of info after every step, got {rule!r}; info has {sorted(info)}.")
+    return info[rule]
+
+
+def _action_mask(info: Mapping[str, Any], actions: tuple[int, ...]) -> NDArray[np.bool_]:
+    mask = info.get(keys.ACTION_MASK)
+    if mask is None or np.ndim(mask) != 1 or len(mask) <= max(actions):
+        raise ValueError(
+            f"info['action_mask'] must have a truth value for each action at resets and after every step, got {mask!r}"
+            "; an environment either always tells which actions can be chosen, or never."
+        )
+    return np.asarray(mask, np.bool_)[list(actions)]
+
+
+class WorldWrapper(gymnasium.Wrapper):
+    """A world of Gymnasium's whose observations are all entries that agents read, and that can be brought back.
+
+    An episode in progress is known by its seed and its actions: an environment that draws all its random numbers from
+    the generator that ``reset(seed=...)`` seeds comes back if the same is done again. One that has ``state_dict`` and
+    ``load_state_dict`` itself, behind no wrappers but those that ``gymnasium.make`` adds, comes back with these.
+
+    Args:
+        env: one world.
+        reading: how entries are read.
+    """
+
+    def __init__(self, env: gymnasium.Env, reading: Reading) -> None:
+        super().__init__(env)
+        self.world = World(reading, env)
+        self.observation_space = reading.space
+        self.entries: Entries = {}
+        self._state = EnvState(env) if EnvState.is_offered(env) else None
+        self._seed: int | None = None
+        self._actions: list[int] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Entries, dict[str, Any]]:
+        """A new episode; see :class:`gymnasium.Env`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._seed, self._actions = seed, []
+        self.entries = self.world.begin(observation, info)
+        return self.entries, {}
+
+    def step(self, action: int) -> tuple[Entries, float, bool, bool, dict[str, Any]]:
+        """One step; see :class:`gymnasium.Env`. An episode that terminates is not truncated."""
+        if self._state is None:
+            self._actions.append(int(action))
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self.entries, reward = self.world.step(observation, float(reward), bool(terminated), bool(truncated), info)
+        return self.entries, reward, bool(terminated), bool(truncated and not terminated), {}
+
+    @property
+    def moment(self) -> dict[str, Any]:
+        """What brings the episode in progress back."""
+        if self._state is None:
+            seed = -1 if self._seed is None else self._seed
+            return {"seed": seed, "actions": torch.tensor(self._actions, dtype=torch.int32)}
+        shown = self.env.observation_space.to_jsonable([self.world.shown])
+        return {"env": self._state.state_dict(), "shown": shown, "subgoals": self.world.subgoals_state()}
+
+    @moment.setter
+    def moment(self, moment: Mapping[str, Any]) -> None:
+        if self._state is None:
+            self.reset(seed=int(moment["seed"]))
+            for action in moment["actions"].tolist():
+                self.step(action)
+            return
+        self.reset()
+        self._state.load_state_dict(moment["env"])
+        shown = self.env.observation_space.from_jsonable(moment["shown"])[0]
+        self.entries = self.world.go_on(shown, moment["subgoals"])
+
+
+class EnvState:
+    """The state of an environment that offers one, with the time that the limit around it has counted.
+
+    Args:
+        env: one world, behind the wrappers that ``gymnasium.make`` adds.
+    """
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        self._env: Any = env.unwrapped
+        self._limits = [each for each in _wrappers(env) if isinstance(each, TimeLimit)]
+
+    @staticmethod
+    def is_offered(env: gymnasium.Env) -> bool:
+        """Whether nothing but its state and those wrappers' make up the world."""
+        usual = all(isinstance(each, TimeLimit | OrderEnforcing | PassiveEnvChecker) for each in _wrappers(env))
+        return usual and all(callable(getattr(env.unwrapped, name, None)) for name in ("state_dict", "load_state_dict"))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Plain data and tensors."""
+        return {"env": self._env.state_dict(), "steps": [each._elapsed_steps for each in self._limits]}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self._env.load_state_dict(state["env"])
+        for limit, steps in zip(self._limits, state["steps"], strict=True):
+            limit._elapsed_steps = steps
+
+
+def _wrappers(env: gymnasium.Env) -> Iterator[gymnasium.Wrapper]:
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
+        env = env.env

@@ -1,0 +1,191 @@
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
+from torchrl.envs.utils import check_env_specs
+
+from hdrqn_torchrl.envs import check_task, make_gym
+from tests.envs.gym.toys import Counter, CountingResets, Forgetful, Milestones, Remembering
+
+STEPS = 40
+
+
+def played(env, steps=STEPS, seed=0):
+    """A rollout with known actions."""
+    torch.manual_seed(seed)
+    return env.rollout(steps, break_when_any_done=False)
+
+
+def go_on(env, tensordict, steps=STEPS):
+    torch.manual_seed(1)
+    rows = []
+    for _ in range(steps):
+        step, tensordict = env.step_and_maybe_reset(env.rand_action(tensordict))
+        rows.append(step.clone())
+    return torch.stack(rows, 1)
+
+
+def test_keeps_torchrl_s_contract_and_that_of_tasks():
+    env = make_gym(Counter, 4, subgoals=Milestones(), success=lambda reward, info: reward > 0, max_steps=30, seed=0)
+    check_env_specs(env)
+    assert [finding.what for finding in check_task(env) if finding.severity == "wrong"] == []
+
+
+def test_subgoals_are_attained_in_the_step_in_which_their_condition_becomes_true():
+    step = played(make_gym(Counter, 3, subgoals=Milestones(), seed=0))
+    before, after = step["observation"][..., 0], step["next", "observation"][..., 0]
+    for index, count in enumerate((5, 8)):
+        assert torch.equal(step["next", "attained"][..., index], (before < count) & (after >= count))
+        assert torch.equal(step["available"][..., index], before < count)
+
+
+@pytest.mark.parametrize("processes", [False, True])
+def test_every_episode_is_reset_once(processes):
+    env = make_gym(CountingResets, 3, processes=processes, seed=0)
+    step = played(env, 25)
+    resets = step["next", "observation"][:, -1, 1]
+    assert torch.equal(resets, 1 + step["next", "done"][:, :-1, 0].sum(1))
+    env.close()
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_vectors_made_elsewhere_lose_no_step_and_no_reset_in_any_autoreset_mode(mode):
+    vector = SyncVectorEnv([CountingResets] * 3, autoreset_mode=mode)
+    step = played(make_gym(vector, 3, subgoals=Milestones(), seed=0))
+    count, done = step["next", "observation"][..., 0], step["next", "done"].squeeze(-1)
+    assert torch.equal(done, count >= 10), "the last observation of an episode is its own"
+    grown = count - step["observation"][..., 0]
+    assert torch.equal(grown, step["action"] + 1.0), "no action was ignored"
+    resets = step["observation"][..., 1]
+    assert torch.equal(resets[:, 1:] - resets[:, :-1], done[:, :-1].float()), "each end was followed by one reset"
+    assert torch.equal(step["next", "attained"][..., 0], (count >= 5) & (step["observation"][..., 0] < 5))
+
+
+def test_a_vector_that_cannot_reset_some_of_its_worlds_is_refused():
+    vector = gymnasium.make_vec("CartPole-v1", num_envs=2, vectorization_mode="vector_entry_point")
+    with pytest.raises(ValueError, match=r"id must be a vector that can reset some .* got CartPoleVectorEnv"):
+        make_gym(vector, 2)
+
+
+def test_a_time_limit_truncates_and_an_end_of_its_own_terminates():
+    step = played(make_gym(Counter, 3, max_steps=4, seed=0))
+    assert step["next", "truncated"].any() and step["next", "terminated"].any()
+    assert not (step["next", "truncated"] & step["next", "terminated"]).any()
+    assert make_gym(Counter, 1, max_steps=4).task.max_steps == 4
+    assert make_gym("CartPole-v1", 1).task.max_steps == 500
+
+
+def test_the_same_seed_gives_the_same_worlds_and_another_seed_others():
+    first, again, other = (played(make_gym(Counter, 3, seed=seed)) for seed in (0, 0, 1))
+    assert torch.equal(first["observation"], again["observation"])
+    assert not torch.equal(first["observation"], other["observation"])
+
+
+class TestRules:
+    def test_reward_success_and_hazard_come_from_info_or_a_function(self):
+        env = make_gym(
+            Counter, 2, reward="count", success="even", hazard=lambda reward, info: info["terminated"], seed=0
+        )
+        step = played(env)["next"]
+        count = step["observation"][..., :1]
+        assert torch.equal(step["reward"], count) and torch.equal(step["extrinsic_reward"], count)
+        assert torch.equal(step["success"], count % 2 == 0) and torch.equal(step["hazard"], step["terminated"])
+
+    def test_an_entry_that_info_lacks_is_named(self):
+        env = make_gym(Counter, 2, success="is_success")
+        with pytest.raises(ValueError, match=r"success must name an entry of info .* got 'is_success'; info has"):
+            env.rollout(2)
+
+    def test_action_masks_are_read_from_info(self):
+        env = make_gym(lambda: Counter(masked=True), 2, seed=0)
+        step = env.rollout(
+            12, lambda td: td.set("action", torch.zeros(2, dtype=torch.int64)), break_when_any_done=False
+        )
+        for each in (step, step["next"]):
+            assert torch.equal(each["action_mask"][..., 1:], each["observation"][..., :1] % 2 == 0)
+
+
+class TestState:
+    @pytest.mark.parametrize("factory", [Counter, lambda: TimeLimit(Counter(), 6), Remembering])
+    def test_episodes_in_progress_go_on_as_if_nothing_had_happened(self, factory):
+        def make(seed):
+            return make_gym(factory, 3, subgoals=Milestones(), seed=seed)
+
+        env = make(0)
+        tensordict = go_on(env, env.reset(), 7)[:, -1]["next"].exclude("reward", "extrinsic_reward")
+        tensordict = env.maybe_reset(tensordict)
+        state = env.state_dict()
+        expected = go_on(env, tensordict.clone(), 3)
+        other = make(5)
+        other.load_state_dict(state)
+        found = go_on(other, tensordict.clone(), 3)
+        for key in ("observation", ("next", "observation"), ("next", "attained"), ("next", "done")):
+            assert torch.equal(expected[key], found[key])
+
+    def test_new_episodes_after_a_restart_are_those_that_would_have_come(self):
+        env = make_gym(Counter, 3, seed=0)
+        tensordict = env.maybe_reset(
+            go_on(env, env.reset(), 5)[:, -1]["next"].select("observation", "done", "terminated", "truncated")
+        )
+        state = env.state_dict()
+        expected = go_on(env, tensordict.clone())
+        env.load_state_dict(state)
+        assert torch.equal(go_on(env, tensordict.clone())["observation"][..., 0], expected["observation"][..., 0])
+
+    def test_episodes_that_cannot_be_brought_back_are_cut_off_and_a_warning_says_so(self):
+        env = make_gym(Forgetful, 3, seed=0)
+        tensordict = go_on(env, env.reset(), 3)[:, -1]["next"].select("observation", "done", "terminated", "truncated")
+        tensordict = env.maybe_reset(tensordict)
+        state = env.state_dict()
+        with pytest.warns(UserWarning, match="could not be brought back .* not be bit for bit"):
+            env.load_state_dict(state)
+        step = go_on(env, tensordict.clone(), 3)
+        assert torch.equal(step["next", "observation"][:, 0], tensordict["observation"])
+        assert step["next", "truncated"][:, 0].all() and not step["next", "reward"][:, 0].any()
+        assert not step["next", "truncated"][:, 1].any()
+
+    def test_another_number_of_worlds_is_refused(self):
+        env = make_gym(Counter, 3)
+        env.reset()
+        with pytest.raises(ValueError, match=r"state_dict must hold 2 worlds, got 3\."):
+            make_gym(Counter, 2).load_state_dict(env.state_dict())
+
+
+@pytest.mark.parametrize(
+    ("id", "settings", "words"),
+    [
+        ("CartPole-v1", {"num_envs": 0}, "num_envs must be >= 1, got 0"),
+        ("NoSuch-v1", {}, "id must be that of an environment that Gymnasium knows, got 'NoSuch-v1'"),
+        (
+            "CartPole-v1",
+            {"settings": {"wheels": 4}},
+            r"settings must be arguments that CartPole-v1 takes, got",
+        ),
+        ("Pendulum-v1", {}, "id must be an environment with one discrete action, got Box"),
+        ("CartPole-v1", {"actions": [0, 2]}, r"actions must be different numbers in \[0, 1\], got \[0, 2\]"),
+        ("CartPole-v1", {"backend": "jax"}, "backend must be 'gymnasium' or 'envpool', got 'jax'"),
+        ("CartPole-v1", {"max_steps": 0}, "max_steps must be >= 1 or None, got 0"),
+        ("CartPole-v1", {"subgoals": "no.such"}, "subgoals must name something that can be imported, got 'no.such'"),
+        ("CartPole-v1", {"subgoals": 3}, "subgoals must have names and a method conditions, got 3"),
+        ("CartPole-v1", {"package": "no_such_package"}, "CartPole-v1 needs no_such_package, which can't be imported"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(id, settings, words):
+    with pytest.raises((ValueError, ImportError), match=words):
+        make_gym(id, **settings)
+
+
+def test_subgoals_that_return_a_wrong_number_of_conditions_are_refused():
+    class Wrong(Milestones):
+        def conditions(self, env, before, after, info):
+            return (True,)
+
+    with pytest.raises(ValueError, match=r"subgoals.conditions must return a truth value for each of the 2 names"):
+        make_gym(Counter, 2, subgoals=Wrong()).reset()
+
+
+def test_fewer_actions_are_the_environment_s_own_by_number():
+    step = played(make_gym(Counter, 2, actions=[1], seed=0), 5)
+    assert np.unique((step["next", "observation"] - step["observation"])[..., 0]).tolist() == [2.0]
