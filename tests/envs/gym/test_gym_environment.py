@@ -2,12 +2,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gym_toys import Counter, CountingResets, Forgetful, Milestones, Remembering
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from torchrl.envs.utils import check_env_specs
 
 from hdrqn_torchrl.envs import check_task, make_gym
-from tests.envs.gym.toys import Counter, CountingResets, Forgetful, Milestones, Remembering
 
 STEPS = 40
 
