@@ -32,6 +32,7 @@ lint: setup
 examples: setup
 	$(BIN)/python examples/reuse_transform.py --frames 2000
 	$(BIN)/python examples/reuse_loss.py --updates 60
+	$(BIN)/python examples/own_task/door_key.py --frames 512 --out $$(mktemp -d)/door_key
 
 clean:
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -77,3 +77,6 @@ class Forgetful(Remembering):
     """The same without a state: nothing brings its episodes back."""
 
     state_dict = load_state_dict = None
+
+
+gymnasium.register(id="Counter-v0", entry_point=Counter)
