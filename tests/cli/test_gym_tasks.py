@@ -21,7 +21,8 @@ ARGUMENTS = [
         "env.num_envs=4",
         "env.max_steps=30",
     ),
-    *("device=cpu", "total_frames=1000", "log_frames=500", "logger=csv", "network.hidden_size=8", "network.widths=[8]"),
+    *("env.max_steps=30", "device=cpu", "total_frames=1000", "log_frames=500", "logger=csv", "network.hidden_size=8"),
+    "network.widths=[8]",
     *(
         "evaluation.num_envs=4",
         "evaluation.episodes=4",
@@ -52,9 +53,7 @@ def test_what_a_command_names_is_trusted_and_both_levels_learn(run):
 
 
 def test_a_run_folder_imports_nothing_that_its_reader_does_not_trust(run, monkeypatch, capsys):
-    with pytest.raises(
-        SystemExit, match=r"must import nothing that this program does not trust, got 'gym_toys\.Milest"
-    ):
+    with pytest.raises(SystemExit, match=r"import nothing that this program does not trust, got 'gym_toys"):
         evaluated(run, monkeypatch)
     evaluated(run, monkeypatch, TRUSTED)
     result = json.loads(capsys.readouterr().out)
