@@ -404,7 +404,9 @@ class TestOptions:
             ({"meta_input": "cell"}, {"sub_cell"}),
             ({"meta_input": "both"}, {"sub_hidden", "sub_cell"}),
         ],
-        ids=str,
+        ids=lambda value: (
+            str(value) if isinstance(value, dict) else "-".join(sorted(value))
+        ),  # the same in every process
     )
     def test_version_and_meta_input_decide_what_the_meta_controller_reads(self, options, entries):
         options = dict(options)
