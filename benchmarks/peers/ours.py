@@ -1,0 +1,153 @@
+"""Our own agents by ``train.py``: ``python benchmarks/peers/ours.py id=MiniGrid-DoorKey-8x8-v0 bonus=1``.
+
+Without ``levels=2`` it is the flat one: v3's memory, loss and predictions without subgoals to choose. The same command
+goes on where it was stopped, from the last checkpoint. All settings but those below are those of ``conf/``.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from arguments import Arguments
+from evaluations import Evaluation, read, write
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OurArguments(Arguments):
+    """Those of all peers, and one more.
+
+    Args:
+        levels: 1: the flat agent; 2: the hierarchical one, which takes no bonus.
+    """
+
+    levels: int = 1
+
+    @property
+    def agent(self) -> str:
+        """Its name in the table."""
+        return "v3_flat" if self.levels == 1 else f"v3_{self.levels}_levels"
+
+    @property
+    def folder(self) -> Path:
+        """Of the run."""
+        return self.runs / self.name_of(self.agent)
+
+
+def settings_of(arguments: OurArguments) -> list[str]:
+    """What ``train.py`` is told; it goes on with a run that lies in the folder already."""
+    return [
+        "env=minigrid",
+        f"env.id={arguments.id}",
+        "algo=v3",
+        f"algo.levels={arguments.levels}",
+        f"algo.bonus_reward={arguments.bonus}",
+        f"seed={arguments.seed}",
+        f"total_frames={arguments.frames}",
+        "device=cpu",
+        f"evaluation.num_envs={min(100, arguments.episodes)}",
+        f"evaluation.episodes={arguments.episodes}",
+        f"evaluation.final_episodes={arguments.final_episodes}",
+        f"evaluation.interval_frames={arguments.interval_frames}",
+        "evaluation.ceilings=false",
+        "checkpoint.keep_last=1",
+        "logger=csv",
+        "resume=auto",
+        f"hydra.run.dir={arguments.folder}",
+    ]
+
+
+def train(arguments: OurArguments) -> float | None:
+    """Trains until frames or time are used up.
+
+    Returns:
+        Processor time; ``None`` if the run was begun before.
+    """
+    is_new, before = not arguments.folder.exists(), os.times()
+    left = arguments.seconds - max((float(row["wall_seconds"]) for row in rows_of(arguments.folder)), default=0.0)
+    if left <= 0:
+        return None
+    words = [sys.executable, str(ROOT / "train.py"), *settings_of(arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(words, env=environment) as process:
+        try:
+            process.wait(None if left == inf else left)
+        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            process.send_signal(signal.SIGTERM)  # it saves first
+            process.wait()
+    if process.returncode not in (0, 128 + signal.SIGTERM, 128 + signal.SIGINT):
+        sys.exit(process.returncode)
+    after = os.times()
+    spent = after.children_user + after.children_system - before.children_user - before.children_system
+    return spent if is_new else None
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    """Log points so far."""
+    path = folder / "metrics.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def evaluations_of(arguments: OurArguments, cpu_seconds: float | None) -> list[Evaluation]:
+    """What a run folder tells, in the words of all peers."""
+    found = [_evaluation(arguments, _figures(row)) for row in rows_of(arguments.folder) if row.get("greedy/return")]
+    summary = arguments.folder / "summary.json"
+    if summary.exists():
+        final = _evaluation(arguments, {**json.loads(summary.read_text()), "cpu_seconds": cpu_seconds})
+        found = [each for each in found if each.frames < final.frames] + [final]
+    return found
+
+
+def _figures(row: dict[str, str]) -> dict[str, Any]:
+    """Of a greedy evaluation while training."""
+    return {
+        "frames": row["frames"],
+        "wall_seconds": row["wall_seconds"],
+        "cpu_seconds": None,
+        "episodes": row["greedy/episodes"],
+        "return_mean": row["greedy/return"],
+        "success_rate": row["greedy/success"],
+        "steps_mean": row["greedy/steps"],
+    }
+
+
+def _evaluation(arguments: OurArguments, figures: dict[str, Any]) -> Evaluation:
+    return Evaluation(
+        agent=arguments.agent,
+        id=arguments.id,
+        bonus=arguments.bonus,
+        seed=arguments.seed,
+        frames=int(float(figures["frames"])),
+        seconds=float(figures["wall_seconds"]),
+        cpu_seconds=figures["cpu_seconds"],
+        episodes=int(float(figures["episodes"])),
+        return_mean=float(figures["return_mean"]),
+        success_rate=float(figures["success_rate"]),
+        steps_mean=float(figures["steps_mean"]),
+    )
+
+
+def main() -> None:
+    """One run."""
+    arguments = OurArguments.read(sys.argv[1:])
+    path = arguments.results / f"{arguments.name_of(arguments.agent)}.jsonl"
+    known = [each.cpu_seconds for each in read(path)[-1:]]
+    spent = train(arguments)
+    write(path, evaluations_of(arguments, known[0] if known and spent is None else spent))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""What agents of different makers are asked for, and how their results come together."""
+
+import json
+from math import inf
+
+import numpy as np
+import ours
+import pytest
+import table
+from arguments import Arguments
+from evaluations import Evaluation, append, read, write
+from hydra import compose, initialize_config_dir
+from ours import OurArguments
+from run_folders import CONF  # and the schema
+
+TASK = "MiniGrid-DoorKey-8x8-v0"
+
+
+def evaluation(frames, success, *, seed=0, agent="v3_flat", bonus=1.0, seconds=None):
+    return Evaluation(
+        agent=agent, id=TASK, bonus=bonus, seed=seed, frames=frames, seconds=seconds or frames / 100, cpu_seconds=None,
+        episodes=10, return_mean=success / 2, success_rate=success, steps_mean=640 * (1 - success),
+    )  # fmt: skip
+
+
+class TestArguments:
+    def test_words_become_values(self):
+        found = OurArguments.read([f"id={TASK}", "frames=2_000", "bonus=0.5", "levels=2", "runs=a/b"])
+        assert (found.frames, found.bonus, found.levels, found.seconds, str(found.runs)) == (2000, 0.5, 2, inf, "a/b")
+        assert found.name_of("x") == f"{TASK}-x-bonus0.5-seed0"
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (["id=a", "frame=3"], "arguments must be NAME=VALUE with a name in .*, got 'frame=3'"),
+            (["id=a", "frames=many"], "frames must be of type int, got 'many'"),
+            ([], "id must be given"),
+        ],
+    )
+    def test_wrong_words_end_the_program_with_a_sentence(self, words, sentence):
+        with pytest.raises(SystemExit, match=sentence):
+            Arguments.read(words)
+
+
+def test_results_survive_on_disk_and_a_line_that_was_cut_off_does_not(tmp_path):
+    path = tmp_path / "new" / "run.jsonl"
+    assert read(path) == []
+    rows = [evaluation(0, 0.0), evaluation(100, 0.5)]
+    for row in rows:
+        append(path, row)
+    path.write_text(path.read_text() + '{"agent": "v3')
+    assert read(path) == rows
+    write(path, rows[:1])
+    assert read(path) == rows[:1]
+
+
+class TestOurs:
+    @pytest.mark.parametrize(("levels", "bonus"), [(1, 1.0), (2, 0.0)])
+    def test_settings_are_those_of_train_py(self, levels, bonus):
+        arguments = OurArguments(id=TASK, seed=3, frames=1000, levels=levels, bonus=bonus)
+        with initialize_config_dir(CONF, version_base="1.3"):
+            config = compose("config", overrides=ours.settings_of(arguments))
+        assert (config.env.id, config.seed, config.total_frames) == (TASK, 3, 1000)
+        assert (config.algo.levels, config.algo.bonus_reward, config.algo.meta_gamma) == (levels, bonus, 0.99)
+        assert (config.evaluation.num_envs, config.evaluation.seed) == (100, 1_000_000)
+
+    def test_a_run_folder_becomes_evaluations(self, tmp_path):
+        arguments = OurArguments(id=TASK, runs=tmp_path, bonus=1.0)
+        arguments.folder.mkdir()
+        columns = "frames,wall_seconds,greedy/return,greedy/success,greedy/steps,greedy/episodes"
+        rows = ["0,1.5,0.0,0.0,640.0,100", "10,5.0,,,,", "50,90.0,0.4,0.5,320.0,100", "80,150.0,0.4,0.5,320.0,100"]
+        (arguments.folder / "metrics.csv").write_text("\n".join([columns, *rows]) + "\n")
+        found = ours.evaluations_of(arguments, 60.0)
+        assert [(each.frames, each.success_rate, each.cpu_seconds) for each in found[:2]] == [
+            (0, 0, None),
+            (50, 0.5, None),
+        ]
+        summary = {"frames": 80, "wall_seconds": 180.0, "episodes": 500, "return_mean": 0.7, "success_rate": 0.75}
+        (arguments.folder / "summary.json").write_text(json.dumps(summary | {"steps_mean": 200.0}))
+        final = ours.evaluations_of(arguments, 60.0)[-1]
+        assert (final.frames, final.episodes, final.success_rate, final.cpu_seconds) == (80, 500, 0.75, 60.0)
+        assert len(ours.evaluations_of(arguments, None)) == 3
+
+    def test_time_that_was_used_up_starts_nothing(self, tmp_path, monkeypatch):
+        arguments = OurArguments(id=TASK, runs=tmp_path, seconds=100.0)
+        arguments.folder.mkdir()
+        (arguments.folder / "metrics.csv").write_text("frames,wall_seconds\n10,101.0\n")
+        monkeypatch.setattr(ours.subprocess, "Popen", None)
+        assert ours.train(arguments) is None
+
+
+class TestTable:
+    @pytest.fixture
+    def results(self, tmp_path):
+        for seed, end in ((0, 0.8), (1, 1.0)):
+            write(tmp_path / f"a{seed}.jsonl", [evaluation(0, 0.0, seed=seed), evaluation(200, end, seed=seed)])
+        slow = {"agent": "recurrent_ppo", "seconds": 8.0}
+        write(tmp_path / "b.jsonl", [evaluation(0, 0.0, agent="recurrent_ppo"), evaluation(100, 0.2, **slow)])
+        return tmp_path
+
+    def test_agents_are_compared_where_the_first_run_ended(self, results):
+        groups = table.read_all(results)[TASK]
+        rows = [[cell.strip() for cell in row.split("|")][2:6] for row in table.rows_of(TASK, groups)]
+        assert [row[:3] for row in rows] == [
+            ["100 frames", "v3_flat, bonus 1", "2"],
+            ["100 frames", "recurrent_ppo, bonus 1", "1"],
+            ["2 seconds", "v3_flat, bonus 1", "2"],
+            ["2 seconds", "recurrent_ppo, bonus 1", "1"],
+        ]
+        assert [row[3] for row in rows] == ["0.450 (-0.185 to 1.085)", "0.200", "0.900 (-0.371 to 2.171)", "0.050"]
+
+    def test_the_figure_has_a_curve_for_each_agent_and_an_interval_where_there_are_seeds(self, results, figures):
+        table.draw(table.read_all(results), results / "peers.png")
+        frames, seconds = figures[0].axes
+        assert [text.get_text() for text in frames.get_legend().get_texts()] == [
+            "v3_flat, bonus 1",
+            "recurrent_ppo, bonus 1",
+        ]
+        curve = frames.lines[0].get_xydata()
+        assert np.allclose(curve[-1], (200, 0.9)) and np.allclose(seconds.lines[1].get_xydata()[-1], (8, 0.2))
+        assert (results / "peers.png").stat().st_size > 0
