@@ -25,6 +25,8 @@ class Evaluation:
         return_mean: without the bonus.
         success_rate: share of episodes that complete the task.
         steps_mean: of all episodes.
+        sampled_success_rate: of as many episodes in the same worlds with actions drawn from the policy; ``None``: it
+            has no probabilities.
     """
 
     agent: str
@@ -38,6 +40,7 @@ class Evaluation:
     return_mean: float
     success_rate: float
     steps_mean: float
+    sampled_success_rate: float | None = None
 
 
 def append(path: Path, evaluation: Evaluation) -> None:

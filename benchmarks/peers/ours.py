@@ -60,7 +60,6 @@ def settings_of(arguments: OurArguments) -> list[str]:
         f"evaluation.final_episodes={arguments.final_episodes}",
         f"evaluation.interval_frames={arguments.interval_frames}",
         "evaluation.ceilings=false",
-        "checkpoint.keep_last=1",
         "logger=csv",
         "resume=auto",
         f"hydra.run.dir={arguments.folder}",

@@ -18,7 +18,7 @@ from evaluations import Evaluation, append, read, write
 from sb3_contrib import RecurrentPPO
 from torchrl import torchrl_logger
 from torchrl.envs import InitTracker, TransformedEnv
-from worlds import GreedyPlayer, PeerVecEnv
+from worlds import PeerVecEnv, Player
 
 from hdrqn_torchrl.envs import make_minigrid
 from hdrqn_torchrl.runs.evaluation import evaluate
@@ -59,10 +59,13 @@ class Run:
         self.model = self._begin()
         known = [each for each in read(self.results) if each.frames <= self.model.num_timesteps]
         write(self.results, known if self.model.num_timesteps else [])
-        self._before = known[-1] if self.model.num_timesteps else None
         env = make_minigrid(arguments.id, min(EVALUATION_ENVS, arguments.episodes), seed=EVALUATION_SEED)
         self.evaluation_env = TransformedEnv(env, InitTracker())
-        self._started, self._cpu_started = time.monotonic(), time.process_time()
+        self._start_clock(known[-1] if self.model.num_timesteps else None)
+
+    def _start_clock(self, before: Evaluation | None) -> None:
+        """Time goes on from that of the last evaluation."""
+        self._before, self._started, self._cpu_started = before, time.monotonic(), time.process_time()
 
     def _begin(self) -> RecurrentPPO:
         """The agent as it was saved last, or a new one."""
@@ -105,29 +108,37 @@ class Run:
                 self.record()
 
     def record(self, *, final: bool = False) -> None:
-        """Plays, writes a line, then saves: a checkpoint's line is always there."""
-        arguments, model = self.arguments, self.model
-        episodes, seed = (
-            (arguments.final_episodes, EVALUATION_SEED + 1) if final else (arguments.episodes, EVALUATION_SEED)
-        )
-        player = GreedyPlayer(model, self.worlds.encode)
-        found = evaluate(self.evaluation_env, player, episodes=episodes, seed=seed)
+        """Plays, writes a line, then saves: a checkpoint's line is always there.
+
+        Ours has no other way to play than the greedy one, so the time of the second evaluation does not count.
+        """
+        arguments = self.arguments
+        found = self.evaluate(final=final, greedy=True)
+        seconds, cpu_seconds = self.seconds, self.cpu_seconds  # until here
         told = Evaluation(
             agent=AGENT,
             id=arguments.id,
             bonus=arguments.bonus,
             seed=arguments.seed,
-            frames=model.num_timesteps,
-            seconds=self.seconds,
-            cpu_seconds=self.cpu_seconds,
+            frames=self.model.num_timesteps,
+            seconds=seconds,
+            cpu_seconds=cpu_seconds,
             episodes=int(found["episodes"]),
             return_mean=found["return_mean"],
             success_rate=found["success_rate"],
             steps_mean=found["steps_mean"],
+            sampled_success_rate=self.evaluate(final=final, greedy=False)["success_rate"],
         )
         append(self.results, told)
         print(told, flush=True)
-        save(model, self.checkpoint)
+        save(self.model, self.checkpoint)
+        self._start_clock(told)
+
+    def evaluate(self, *, final: bool, greedy: bool) -> dict[str, float]:
+        """The averages of episodes."""
+        episodes = self.arguments.final_episodes if final else self.arguments.episodes
+        player = Player(self.model, self.worlds.encode, greedy=greedy)
+        return evaluate(self.evaluation_env, player, episodes=episodes, seed=EVALUATION_SEED + final)
 
 
 def save(model: RecurrentPPO, path: Path) -> None:

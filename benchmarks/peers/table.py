@@ -23,7 +23,12 @@ from hdrqn_torchrl.analysis.intervals import mean_interval
 Run = list[Evaluation]
 Groups = dict[str, list[Run]]
 AXES = {"frames": "environment frames", "seconds": "seconds"}
-FIGURES = {"success_rate": ("success", ".3f"), "return_mean": ("return", ".3f"), "steps_mean": ("steps", ".1f")}
+FIGURES = {
+    "success_rate": ("success", ".3f"),
+    "return_mean": ("return", ".3f"),
+    "steps_mean": ("steps", ".1f"),
+    "sampled_success_rate": ("success, actions drawn", ".3f"),
+}
 
 
 def read_all(folder: Path) -> dict[str, Groups]:
@@ -36,8 +41,8 @@ def read_all(folder: Path) -> dict[str, Groups]:
 
 
 def values_at(runs: Sequence[Run], axis: str, figure: str, places: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A figure of runs at places of an axis, ``[P, R]``."""
-    curves = [[[getattr(each, name) for each in run] for name in (axis, figure)] for run in runs]
+    """A figure of runs at places of an axis, ``[P, R]``; NaN where it is not known."""
+    curves = [[np.array([getattr(each, name) for each in run], float) for name in (axis, figure)] for run in runs]
     return np.stack([np.interp(places, *curve) for curve in curves], -1)
 
 
@@ -60,12 +65,12 @@ def rows_of(task: str, groups: Groups) -> list[str]:
 def _cell(values: NDArray[np.float64], form: str) -> str:
     """The mean of ``[1, R]`` with its interval."""
     low, high = mean_interval(values)
-    mean = format(values.mean(), form)
+    mean = "-" if np.isnan(values).any() else format(values.mean(), form)
     return mean if np.isnan(low[0]) else f"{mean} ({low[0]:{form}} to {high[0]:{form}})"
 
 
 def draw(tasks: dict[str, Groups], path: Path) -> None:
-    """Success of all agents over frames and over seconds, a row for each task."""
+    """Success of all agents over frames and over seconds, a row for each task; dashed: with actions drawn."""
     figure = Figure(figsize=(10, 3.4 * len(tasks)), layout="constrained")
     panels = figure.subplots(len(tasks), len(AXES), squeeze=False, sharey=True)
     for row, (task, groups) in zip(panels, tasks.items(), strict=True):
@@ -83,8 +88,9 @@ def draw(tasks: dict[str, Groups], path: Path) -> None:
 def _curve(panel: Axes, runs: Sequence[Run], axis: str, label: str) -> None:
     """The mean over seeds, as far as all of them go, with its interval."""
     places = np.linspace(0.0, min(getattr(run[-1], axis) for run in runs), 100)
-    values = values_at(runs, axis, "success_rate", places)
+    values, sampled = (values_at(runs, axis, name, places) for name in ("success_rate", "sampled_success_rate"))
     (line,) = panel.plot(places, values.mean(-1), label=label)
+    panel.plot(places, sampled.mean(-1), "--", color=line.get_color(), linewidth=1)
     panel.fill_between(places, *mean_interval(values), color=line.get_color(), alpha=0.2)
 
 

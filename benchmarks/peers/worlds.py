@@ -119,18 +119,19 @@ class PeerVecEnv(VecEnv):
         return [False] * self.num_envs
 
 
-class GreedyPlayer(TensorDictModuleBase):
-    """A recurrent agent of sb3-contrib that plays its likeliest actions in an environment of ours.
+class Player(TensorDictModuleBase):
+    """A recurrent agent of sb3-contrib that plays in an environment of ours.
 
     Args:
         model: the agent.
         encode: as in its training.
+        greedy: whether it plays its likeliest actions or draws them.
     """
 
-    def __init__(self, model: RecurrentPPO, encode: OneHot) -> None:
+    def __init__(self, model: RecurrentPPO, encode: OneHot, *, greedy: bool = True) -> None:
         super().__init__()
         self.in_keys, self.out_keys = [keys.OBSERVATION, keys.IS_INIT], [keys.ACTION]
-        self.policy, self.encode = model.policy, encode
+        self.policy, self.encode, self.greedy = model.policy, encode, greedy
         self._state: tuple[NDArray, ...] | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -139,6 +140,6 @@ class GreedyPlayer(TensorDictModuleBase):
             self.encode(tensordict[keys.OBSERVATION]),
             state=self._state,
             episode_start=tensordict[keys.IS_INIT].squeeze(-1).numpy(),
-            deterministic=True,
+            deterministic=self.greedy,
         )
         return tensordict.set(keys.ACTION, torch.as_tensor(action))

@@ -16,10 +16,11 @@ from run_folders import CONF  # and the schema
 TASK = "MiniGrid-DoorKey-8x8-v0"
 
 
-def evaluation(frames, success, *, seed=0, agent="v3_flat", bonus=1.0, seconds=None):
+def evaluation(frames, success, *, seed=0, agent="v3_flat", bonus=1.0, seconds=None, sampled=None):
     return Evaluation(
         agent=agent, id=TASK, bonus=bonus, seed=seed, frames=frames, seconds=seconds or frames / 100, cpu_seconds=None,
         episodes=10, return_mean=success / 2, success_rate=success, steps_mean=640 * (1 - success),
+        sampled_success_rate=sampled,
     )  # fmt: skip
 
 
@@ -79,7 +80,7 @@ class TestOurs:
         (arguments.folder / "summary.json").write_text(json.dumps(summary | {"steps_mean": 200.0}))
         final = ours.evaluations_of(arguments, 60.0)[-1]
         assert (final.frames, final.episodes, final.success_rate, final.cpu_seconds) == (80, 500, 0.75, 60.0)
-        assert len(ours.evaluations_of(arguments, None)) == 3
+        assert len(ours.evaluations_of(arguments, None)) == 3 and final.sampled_success_rate is None
 
     def test_time_that_was_used_up_starts_nothing(self, tmp_path, monkeypatch):
         arguments = OurArguments(id=TASK, runs=tmp_path, seconds=100.0)
@@ -94,8 +95,10 @@ class TestTable:
     def results(self, tmp_path):
         for seed, end in ((0, 0.8), (1, 1.0)):
             write(tmp_path / f"a{seed}.jsonl", [evaluation(0, 0.0, seed=seed), evaluation(200, end, seed=seed)])
-        slow = {"agent": "recurrent_ppo", "seconds": 8.0}
-        write(tmp_path / "b.jsonl", [evaluation(0, 0.0, agent="recurrent_ppo"), evaluation(100, 0.2, **slow)])
+        slow = {"agent": "recurrent_ppo", "seconds": 8.0, "sampled": 0.4}
+        write(
+            tmp_path / "b.jsonl", [evaluation(0, 0.0, agent="recurrent_ppo", sampled=0.0), evaluation(100, 0.2, **slow)]
+        )
         return tmp_path
 
     def test_agents_are_compared_where_the_first_run_ended(self, results):
@@ -116,6 +119,13 @@ class TestTable:
             "v3_flat, bonus 1",
             "recurrent_ppo, bonus 1",
         ]
+        assert [row.split("|")[8].strip() for row in table.rows_of(TASK, table.read_all(results)[TASK])] == [
+            "-",
+            "0.400",
+            "-",
+            "0.100",
+        ]
         curve = frames.lines[0].get_xydata()
-        assert np.allclose(curve[-1], (200, 0.9)) and np.allclose(seconds.lines[1].get_xydata()[-1], (8, 0.2))
+        assert np.allclose(curve[-1], (200, 0.9)) and np.allclose(seconds.lines[2].get_xydata()[-1], (8, 0.2))
+        assert np.allclose(seconds.lines[3].get_xydata()[-1], (8, 0.4))
         assert (results / "peers.png").stat().st_size > 0

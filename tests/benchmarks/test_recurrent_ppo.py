@@ -11,7 +11,7 @@ pytest.importorskip("sb3_contrib")
 import recurrent_ppo
 from arguments import Arguments
 from evaluations import read
-from worlds import GreedyPlayer, OneHot, PeerVecEnv
+from worlds import OneHot, PeerVecEnv, Player
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv, make_minigrid
 from hdrqn_torchrl.runs.evaluation import evaluate, play
@@ -110,7 +110,7 @@ class TestRun:
         run = recurrent_ppo.Run(asked(tmp_path))
         seen = []
 
-        class Watching(GreedyPlayer):
+        class Watching(Player):
             def forward(self, tensordict):
                 seen.append(tensordict["observation"].clone())
                 return super().forward(tensordict)
@@ -150,6 +150,28 @@ class TestRun:
         assert [(each.frames, each.episodes) for each in read(run.results)] == [(0, 2), (16, 2), (32, 4)]
         assert read(run.results)[-1].seconds > 1200.0
 
+    def test_the_second_evaluation_draws_actions_and_takes_no_time(self, tmp_path, monkeypatch):
+        run = recurrent_ppo.Run(asked(tmp_path))
+        evaluate, asked_for = run.evaluate, []
+
+        def slowly(*, final, greedy):
+            asked_for.append(greedy)
+            run._started -= 0.0 if greedy else 500.0
+            return {**evaluate(final=final, greedy=greedy), "success_rate": 0.25 if greedy else 0.75}
+
+        monkeypatch.setattr(run, "evaluate", slowly)
+        run.record()
+        (told,) = read(run.results)
+        assert asked_for == [True, False] and (told.success_rate, told.sampled_success_rate) == (0.25, 0.75)
+        assert told.seconds < 500.0 and run.seconds < 500.0
+
+    def test_drawn_actions_differ_from_the_likeliest(self, tmp_path):
+        run = recurrent_ppo.Run(asked(tmp_path))
+        shown = TransformedEnv(task(), InitTracker()).reset()
+        for greedy, number in ((True, 1), (False, 6)):
+            player = Player(run.model, run.worlds.encode, greedy=greedy)
+            assert len({int(player(shown.clone())["action"][0]) for _ in range(100)}) == number
+
     def test_a_seed_repeats(self, tmp_path):
         lines = []
         for name in "ab":
@@ -163,6 +185,6 @@ class TestRun:
         before = [each.clone() for each in run.model.policy.parameters()]
         run.train()
         assert any(not torch.equal(a, b) for a, b in zip(before, run.model.policy.parameters(), strict=True))
-        player = GreedyPlayer(run.model, run.worlds.encode)
+        player = Player(run.model, run.worlds.encode)
         found = evaluate(run.evaluation_env, player, episodes=4, seed=recurrent_ppo.EVALUATION_SEED + 1)
         assert found["steps_mean"] == read(run.results)[-1].steps_mean
