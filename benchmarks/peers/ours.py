@@ -21,6 +21,8 @@ from arguments import Arguments
 from evaluations import Evaluation, read, write
 
 ROOT = Path(__file__).parents[2]
+_STOPS = (signal.SIGTERM, signal.SIGINT)
+_WELL = (0, *(128 + stop for stop in _STOPS), *(-stop for stop in _STOPS))  # exit codes: done, stopped
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,10 @@ class OurArguments(Arguments):
         return self.runs / self.name_of(self.agent)
 
 
+FLAT = ["algo.sub_exploration._target_=hdrqn_torchrl.modules.RepeatingEpsilonGreedy"]
+"""The same epsilons and repeated actions; an agent without subgoals has no success of theirs to explore less by."""
+
+
 def settings_of(arguments: OurArguments) -> list[str]:
     """What ``train.py`` is told; it goes on with a run that lies in the folder already."""
     return [
@@ -52,6 +58,7 @@ def settings_of(arguments: OurArguments) -> list[str]:
         "algo=v3",
         f"algo.levels={arguments.levels}",
         f"algo.bonus_reward={arguments.bonus}",
+        *(FLAT if arguments.levels == 1 else []),
         f"seed={arguments.seed}",
         f"total_frames={arguments.frames}",
         "device=cpu",
@@ -84,8 +91,8 @@ def train(arguments: OurArguments) -> float | None:
         except (subprocess.TimeoutExpired, KeyboardInterrupt):
             process.send_signal(signal.SIGTERM)  # it saves first
             process.wait()
-    if process.returncode not in (0, 128 + signal.SIGTERM, 128 + signal.SIGINT):
-        sys.exit(process.returncode)
+    if process.returncode not in _WELL:
+        sys.exit(f"error: train.py ended with exit code {process.returncode}; see above.")
     after = os.times()
     spent = after.children_user + after.children_system - before.children_user - before.children_system
     return spent if is_new else None

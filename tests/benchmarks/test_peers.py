@@ -11,7 +11,10 @@ from arguments import Arguments
 from evaluations import Evaluation, append, read, write
 from hydra import compose, initialize_config_dir
 from ours import OurArguments
-from run_folders import CONF  # and the schema
+from run_folders import CONF
+
+from hdrqn_torchrl.cli.configuration import resolved
+from hdrqn_torchrl.runs.building import build_algorithm
 
 TASK = "MiniGrid-DoorKey-8x8-v0"
 
@@ -64,6 +67,10 @@ class TestOurs:
         assert (config.env.id, config.seed, config.total_frames) == (TASK, 3, 1000)
         assert (config.algo.levels, config.algo.bonus_reward, config.algo.meta_gamma) == (levels, bonus, 0.99)
         assert (config.evaluation.num_envs, config.evaluation.seed) == (100, 1_000_000)
+        pytest.importorskip("minigrid")
+        config.env.num_envs = 2
+        _, algorithm = build_algorithm(resolved(config))
+        assert len(algorithm.levels) == levels
 
     def test_a_run_folder_becomes_evaluations(self, tmp_path):
         arguments = OurArguments(id=TASK, runs=tmp_path, bonus=1.0)
@@ -81,6 +88,38 @@ class TestOurs:
         final = ours.evaluations_of(arguments, 60.0)[-1]
         assert (final.frames, final.episodes, final.success_rate, final.cpu_seconds) == (80, 500, 0.75, 60.0)
         assert len(ours.evaluations_of(arguments, None)) == 3 and final.sampled_success_rate is None
+
+    @pytest.mark.parametrize("code", [0, 143, -15, 1])
+    def test_a_run_that_is_stopped_is_no_error_and_one_that_fails_is(self, tmp_path, monkeypatch, code):
+        signals = []
+
+        class Process:
+            returncode = code
+
+            def __init__(self, words, env):
+                assert words[1].endswith("train.py") and env["OMP_NUM_THREADS"] == "1"
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_):
+                pass
+
+            def wait(self, timeout=None):
+                if timeout is not None:
+                    raise ours.subprocess.TimeoutExpired("train.py", timeout)
+
+            def send_signal(self, number):
+                signals.append(number)
+
+        monkeypatch.setattr(ours.subprocess, "Popen", Process)
+        arguments = OurArguments(id=TASK, runs=tmp_path, seconds=100.0)
+        if code == 1:
+            with pytest.raises(SystemExit, match=r"train\.py ended with exit code 1"):
+                ours.train(arguments)
+        else:
+            assert ours.train(arguments) is not None
+        assert signals == [ours.signal.SIGTERM]
 
     def test_time_that_was_used_up_starts_nothing(self, tmp_path, monkeypatch):
         arguments = OurArguments(id=TASK, runs=tmp_path, seconds=100.0)
