@@ -177,7 +177,7 @@ def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, p
     first = {"render_mode": "rgb_array"} if "rgb_array" in modes else {}
     worlds = [partial(_world, make, reading, first if index == 0 else {}) for index in range(num_envs)]
     vector: SyncVectorEnv | AsyncVectorEnv
-    if processes:
+    if processes and num_envs > 1:  # a single one, such as that of a picture, stays here
         vector = AsyncVectorEnv(worlds, autoreset_mode=AutoresetMode.DISABLED)
     else:
         vector = SyncVectorEnv(worlds, copy=False, autoreset_mode=AutoresetMode.DISABLED)

@@ -121,7 +121,7 @@ def _look(id: str, options: Mapping[str, Any]) -> tuple[Survey, bool]:
 
 def _reference(make: Any, player: str, what: str, id: str, options: Mapping[str, Any]) -> Reference:
     key = f"{player}, {id}, {sorted(options.items())}"
-    return Reference(what=what, play=lambda seconds: play(make, player, seconds), key=key)
+    return Reference(what=what, play=partial(play, make, player), key=key)
 
 
 def _actions(id: str) -> Sequence[int] | None:
