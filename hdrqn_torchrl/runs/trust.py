@@ -9,7 +9,6 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from hdrqn_torchrl.envs.gym.making import PACKAGES
 from hdrqn_torchrl.runs.arguments import TARGET, Settings, SettingsError
 from hdrqn_torchrl.runs.stored_settings import check_plain
 
@@ -47,6 +46,8 @@ BUILDERS = {
 """What a ``_target_`` may name, by its place; a user's own are added with ``allowed_targets=[package.builder]``."""
 
 ALLOWED_TARGETS = tuple(target for targets in BUILDERS.values() for target in targets)
+KNOWN_PACKAGES = ("ale_py", "minigrid", "popgym", "vizdoom.gymnasium_wrapper", "hdrqn_torchrl.envs.gym")
+"""Packages of environments that may be imported: those that ``make_gym`` knows, named again as it loads torch."""
 _MAKES_GYM = ("hdrqn_torchrl.envs.make_gym", "hdrqn_torchrl.envs.make_minigrid")
 _LOGGER = re.compile(r"logger\.loggers\[\d+\]")
 _MARKS = {"_recursive_": (False,), "_convert_": ("all",)}  # of Hydra, as the files of conf/ use them: for loggers
@@ -128,7 +129,7 @@ def imports_of(settings: Settings) -> list[str]:
             each for each in (value if isinstance(value, list) else [value]) if isinstance(each, str) and "." in each
         ]
     package, module = settings.get("package"), str(settings.get("id", "")).rpartition(":")[0]
-    return found + [each for each in (package, module) if each and each not in PACKAGES.values()]
+    return found + [each for each in (package, module) if each and each not in KNOWN_PACKAGES]
 
 
 def _nodes(settings: Any, path: str) -> Iterator[tuple[str, Settings]]:

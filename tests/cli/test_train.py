@@ -57,11 +57,12 @@ class TestTree:
     @pytest.mark.parametrize("algo", choices("algo"))
     @pytest.mark.parametrize("env", choices("env"))
     def test_every_combination_composes_builds_and_collects(self, env, algo, network):
-        config = configure(f"env={env}", f"algo={algo}", f"network={network}", "env.num_envs=2")
+        own = ["env.id=gym_toys:Counter-v0", "env.subgoals=gym_toys.Milestones"] if env == "gym" else []
+        config = configure(f"env={env}", f"algo={algo}", f"network={network}", "env.num_envs=2", *own)
         config.network.hidden_size = 8
         settings = resolved(config)
         train.check(settings)
-        base, algorithm = build_algorithm(settings, {"seed": 0})
+        base, algorithm = build_algorithm(settings, {"seed": 0}, settings.allowed_targets)
         assert set(algorithm.explorations) in ({"flat"}, {"sub", "meta"})
         assert set(algorithm.learners) == ({"joint"} if algo == "v3" else set(algorithm.explorations))
         batch = next(iter(make_collector(algorithm, base, 2)))

@@ -135,7 +135,7 @@ def test_interrupting_the_show_is_not_an_error(run, command, monkeypatch):
         (["episodes=0"], "error: episodes must be >= 1, got 0"),
         (["fps=0"], r"error: fps must lie in [1, 50], got 0"),
         (["epsilon=2"], "error: epsilon must lie in [0, 1], got 2.0"),
-        (["env.views=3"], "error: env.views must be one of"),
+        (["env.views=3"], "error: env.KEY must be one of"),
         (["env.view=4"], "view must be an odd number of cells"),
         (["checkpoint=nowhere"], "error: checkpoint"),
         (["speed=3"], "the settings are run, out, episodes"),

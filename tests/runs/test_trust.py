@@ -9,9 +9,10 @@ from omegaconf import OmegaConf
 from run_folders import CONF, configure
 
 from hdrqn_torchrl.cli.configuration import plain, resolved
+from hdrqn_torchrl.envs.gym.making import PACKAGES
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.settings import check
-from hdrqn_torchrl.runs.trust import ALLOWED_TARGETS, check_targets
+from hdrqn_torchrl.runs.trust import ALLOWED_TARGETS, KNOWN_PACKAGES, check_targets
 
 
 @pytest.fixture
@@ -56,3 +57,7 @@ class TestCheckTargets:
         check_targets(plain(settings), ["my_package.MyEnv"])
         settings.allowed_targets = ["my_package.MyEnv"]
         check(resolved(settings))
+
+
+def test_packages_that_make_gym_knows_may_be_imported():
+    assert set(KNOWN_PACKAGES) == set(PACKAGES.values())

@@ -86,7 +86,7 @@ def make_encoder(
         >>> make_encoder(spaces.Box(0, 255, (210, 160, 3), np.uint8)).space.shape
         (3, 210, 160)
         >>> make_encoder(spaces.Box(0, 255, (7, 7, 3), np.uint8), codes=(11, 6, 3)).space.nvec[:4]
-        array([11,  6,  3, 11])
+        array([11,  6,  3, 11], dtype=uint8)
         >>> make_encoder(spaces.Text(20), words=("go", "left"), text_length=3).encode("go far left")
         array([1, 0, 2], dtype=uint8)
     """

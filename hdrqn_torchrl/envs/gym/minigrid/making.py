@@ -69,7 +69,7 @@ def make_minigrid(
     Examples:
         >>> env = make_minigrid("MiniGrid-DoorKey-5x5-v0", num_envs=2, seed=0)
         >>> env.task.subgoals[-1].names
-        ('pick up the key', 'unlock the locked door', 'reach the goal', 'complete the mission')
+        ('pick up the key', 'unlock the locked door', 'reach the goal')
     """
     import_package_of(id)
     options = {**(settings or {}), **({} if max_steps is None else {"max_steps": max_steps})}

@@ -27,9 +27,9 @@ class Deed(NamedTuple):
 class ObjectSubgoals(Subgoals):
     """Pick up a thing, open a box, unlock or open a door, stand before an object, reach the goal, enter a room.
 
-    Objects of a kind are told apart by colour where an episode has several that differ in it. Only the first time
-    counts, but for rooms: each one that was not entered before counts. What an episode lacks, or what is done, is not
-    worth choosing.
+    To complete the mission is a subgoal where there is no goal to reach. Objects of a kind are told apart by colour
+    where an episode has several that differ in it. Only the first time counts, but for rooms: each one that was not
+    entered before counts. What an episode lacks, or what is done, is not worth choosing.
 
     Args:
         found: what occurs in the task's episodes.
@@ -96,12 +96,13 @@ def deeds_of(found: Survey) -> list[Deed]:
         deeds += [Deed("pick up", kind, colour) for colour in _colours(found, kind)]
     deeds += [Deed("open", "box")] if found.objects["box"] and "key" in found.objects else []
     deeds += [Deed("unlock", "locked door")] if found.locked_doors else []
-    deeds += [Deed("open", "door", colour) for colour in _colours(found, "door")]
+    if found.objects["door"] > found.locked_doors:  # else to open it is to unlock it
+        deeds += [Deed("open", "door", colour) for colour in _colours(found, "door")]
     if found.goes_to:
         deeds += [Deed("stand before", kind, c) for kind in (*THINGS, "door") for c in _colours(found, kind)]
     deeds += [Deed("reach", "goal")] if found.objects["goal"] else []
     deeds += [Deed("enter", "room")] if found.rooms else []
-    return [*deeds, Deed("complete the mission")]
+    return deeds if found.objects["goal"] else [*deeds, Deed("complete the mission")]
 
 
 def _colours(found: Survey, kind: str) -> tuple[str | None, ...]:

@@ -30,10 +30,8 @@ def bot_s_actions(env):
 
 class TestSubgoals:
     def test_are_what_can_be_done_with_the_objects_of_the_task(self):
-        assert names("MiniGrid-DoorKey-5x5-v0") == (
-            "pick up the key", "unlock the locked door", "open the door", "reach the goal", "complete the mission",
-        )  # fmt: skip
-        assert names("MiniGrid-Empty-5x5-v0") == ("reach the goal", "complete the mission")
+        assert names("MiniGrid-DoorKey-5x5-v0") == ("pick up the key", "unlock the locked door", "reach the goal")
+        assert names("MiniGrid-Empty-5x5-v0") == ("reach the goal",)
 
     def test_tell_objects_apart_by_colour_where_an_episode_has_several_colours(self):
         assert names("MiniGrid-KeyCorridorS3R3-v0") == (
