@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from run_folders import CONF, configure
 
 from hdrqn_torchrl.cli.configuration import plain, resolved
-from hdrqn_torchrl.envs.gym.making import PACKAGES
+from hdrqn_torchrl.envs.gym.arguments import PACKAGES
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.settings import check
 from hdrqn_torchrl.runs.trust import ALLOWED_TARGETS, KNOWN_PACKAGES, check_targets

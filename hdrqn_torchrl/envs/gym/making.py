@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import math
-import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import partial
 from typing import Any, Literal
 
@@ -18,25 +15,22 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from gymnasium.wrappers import TimeLimit
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs.gym.arguments import (
+    SomeSubgoals,
+    action_names_of,
+    actions_of,
+    import_package_of,
+    rule_of,
+    subgoals_of,
+    wrappers_of,
+)
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
 from hdrqn_torchrl.envs.gym.observations import make_encoder
-from hdrqn_torchrl.envs.gym.subgoals import Subgoals
 from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
 from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper
 from hdrqn_torchrl.envs.task import Task
 
-PACKAGES = {
-    "ALE/": "ale_py",
-    "MiniGrid-": "minigrid",
-    "BabyAI-": "minigrid",
-    "popgym-": "popgym",
-    "Vizdoom": "vizdoom.gymnasium_wrapper",
-    "hdrqn/": "hdrqn_torchrl.envs.gym",
-}
-"""Packages that register environments, by how the ids begin. They are imported for these ids."""
-
 EnvFactory = Callable[[], gymnasium.Env]
-SomeSubgoals = Subgoals | str | Sequence[Subgoals | str] | None
 
 
 def make_gym(
@@ -76,7 +70,8 @@ def make_gym(
         num_envs: N.
         subgoals: a set of subgoals, or several from near to far; ``None``: agents of one level only.
         settings: keyword arguments for ``gymnasium.make``.
-        package: that registers the id when it is imported, if it is none of :data:`PACKAGES`.
+        package: that registers the id when it is imported, if it is none of
+            :data:`~hdrqn_torchrl.envs.gym.arguments.PACKAGES`.
         wrappers: put around every world, the first one innermost.
         entries, codes, words, text_length: of observations; see :func:`~hdrqn_torchrl.envs.gym.make_encoder`.
         actions: numbers of the actions that the agent has; ``None``: all.
@@ -109,8 +104,8 @@ def make_gym(
         actions=actions,
         options={"entries": entries, "codes": codes, "words": words, "text_length": text_length},
         rest={
-            "subgoals": _subgoals(subgoals),
-            **{key: _rule(key, rule) for key, rule in (("reward", reward), ("success", success), ("hazard", hazard))},
+            "subgoals": subgoals_of(subgoals),
+            **{key: rule_of(key, rule) for key, rule in (("reward", reward), ("success", success), ("hazard", hazard))},
         },
     )
     if isinstance(id, VectorEnv):
@@ -119,7 +114,7 @@ def make_gym(
         made = _pooled(id, num_envs, read, {**(settings or {}), **_limit(max_steps)})
     elif backend == "gymnasium":
         made = _own(
-            _factory(id, settings, package, _wrappers(wrappers), max_steps), num_envs, read, processes=processes
+            _factory(id, settings, package, wrappers_of(wrappers), max_steps), num_envs, read, processes=processes
         )
     else:
         raise ValueError(f"backend must be 'gymnasium' or 'envpool', got {backend!r}.")
@@ -160,7 +155,7 @@ def _read(
     rest: Mapping[str, Any],
 ) -> tuple[Reading, tuple[int, ...]]:
     """How entries are read, and the numbers of the agent's actions, for the spaces of one world."""
-    numbers = _actions(acted, actions)
+    numbers = actions_of(acted, actions)
     return Reading(encoder=make_encoder(observed, **options), masked_actions=numbers if masked else (), **rest), numbers
 
 
@@ -170,7 +165,7 @@ def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, p
     try:
         _, info = probe.reset(seed=0)
         reading, actions = read(probe.observation_space, probe.action_space, masked=keys.ACTION_MASK in info)
-        names, limit = _action_names(probe, actions), _time_limit(probe)
+        names, limit = action_names_of(probe, actions), _time_limit(probe)
         modes = probe.metadata.get("render_modes") or ()
     finally:
         probe.close()
@@ -284,83 +279,3 @@ def _time_limit(env: gymnasium.Env) -> int | None:
     if isinstance(env, gymnasium.Wrapper):
         limits += [_time_limit(env.env) or 0]
     return min((limit for limit in limits if limit), default=None)
-
-
-def _actions(space: spaces.Space, chosen: Sequence[int] | None) -> tuple[int, ...]:
-    """The environment's numbers of the agent's actions."""
-    if not isinstance(space, spaces.Discrete):
-        raise ValueError(
-            f"id must be an environment with one discrete action, got {space}; number the combinations of its parts, "
-            "or choose some, with a wrapper (gymnasium.wrappers.TransformAction)."
-        )
-    all_of_them = range(int(space.start), int(space.start + space.n))
-    if chosen is None:
-        return tuple(all_of_them)
-    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(all_of_them):
-        raise ValueError(f"actions must be different numbers in {list(all_of_them)}, got {list(chosen)}.")
-    return tuple(chosen)
-
-
-def _action_names(env: gymnasium.Env, actions: Sequence[int]) -> tuple[str, ...]:
-    """As ALE's environments and MiniGrid's tell them; empty if the environment does not."""
-    meanings = getattr(env.unwrapped, "get_action_meanings", None)
-    if callable(meanings):
-        return tuple(str(meanings()[action]).lower() for action in actions)
-    named = getattr(env.unwrapped, "actions", None)
-    if isinstance(named, type) and issubclass(named, IntEnum):
-        return tuple(named(action).name for action in actions)
-    return ()
-
-
-def _subgoals(given: SomeSubgoals) -> tuple[Subgoals, ...]:
-    """All sets, from near to far; names are looked up, classes are made."""
-    sets = [] if given is None else list(given) if isinstance(given, list | tuple) else [given]
-    found = [_named("subgoals", each) for each in sets]
-    made = tuple(each() if isinstance(each, type) else each for each in found)
-    for each in made:
-        if not callable(getattr(each, "conditions", None)) or not getattr(each, "names", None):
-            raise ValueError(
-                f"subgoals must have names and a method conditions, got {each!r}; derive a class from "
-                "hdrqn_torchrl.envs.gym.Subgoals."
-            )
-    prefixes = [each.prefix for each in made]
-    if made and (len(set(prefixes)) < len(made) or prefixes[-1]):
-        raise ValueError(f"subgoals must have different prefixes, and the last, farthest set none, got {prefixes}.")
-    return made
-
-
-def _rule(name: str, rule: str | Rule | None) -> str | Rule | None:
-    """A function, or the name of an entry of ``info``; names with dots are those of functions."""
-    return _named(name, rule) if isinstance(rule, str) and "." in rule else rule
-
-
-def _wrappers(given: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str]) -> list[Callable]:
-    return [_named("wrappers", each) for each in given]
-
-
-def _named(argument: str, value: Any) -> Any:
-    """What a string names; anything else as it is."""
-    if not isinstance(value, str):
-        return value
-    try:
-        return pkgutil.resolve_name(value)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{argument} must name something that can be imported, got {value!r} ({error}).") from error
-
-
-def import_package_of(id: str, package: str | None = None) -> None:
-    """Imports the package that registers an id.
-
-    Args:
-        id: of an environment.
-        package: its package; ``None``: as :data:`PACKAGES` says, which is none for environments of Gymnasium itself.
-
-    Raises:
-        ImportError: if it is missing.
-    """
-    known = [each for start, each in PACKAGES.items() if id.startswith(start)]
-    for name in [package] if package else known:
-        try:
-            gymnasium.register_envs(importlib.import_module(name))
-        except ImportError as error:
-            raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it.") from error

@@ -10,8 +10,9 @@ from typing import Any
 import gymnasium
 import torch
 
+from hdrqn_torchrl.envs.gym.arguments import SomeSubgoals, import_package_of
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
-from hdrqn_torchrl.envs.gym.making import SomeSubgoals, import_package_of, make_gym
+from hdrqn_torchrl.envs.gym.making import make_gym
 from hdrqn_torchrl.envs.gym.minigrid.bot import bot_can_play, play
 from hdrqn_torchrl.envs.gym.minigrid.scene import minigrid_scene
 from hdrqn_torchrl.envs.gym.minigrid.subgoals import ObjectSubgoals

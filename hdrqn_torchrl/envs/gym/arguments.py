@@ -1,0 +1,108 @@
+"""What a user hands to ``make_gym``, checked and looked up: actions, subgoals, rules, wrappers, packages."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import Any
+
+import gymnasium
+from gymnasium import spaces
+
+from hdrqn_torchrl.envs.gym.subgoals import Subgoals
+from hdrqn_torchrl.envs.gym.worlds import Rule
+
+PACKAGES = {
+    "ALE/": "ale_py",
+    "MiniGrid-": "minigrid",
+    "BabyAI-": "minigrid",
+    "popgym-": "popgym",
+    "Vizdoom": "vizdoom.gymnasium_wrapper",
+    "hdrqn/": "hdrqn_torchrl.envs.gym",
+}
+"""Packages that register environments, by how the ids begin. They are imported for these ids."""
+
+SomeSubgoals = Subgoals | str | Sequence[Subgoals | str] | None
+
+
+def actions_of(space: spaces.Space, chosen: Sequence[int] | None) -> tuple[int, ...]:
+    """The environment's numbers of the agent's actions."""
+    if not isinstance(space, spaces.Discrete):
+        raise ValueError(
+            f"id must be an environment with one discrete action, got {space}; number the combinations of its parts, "
+            "or choose some, with a wrapper (gymnasium.wrappers.TransformAction)."
+        )
+    all_of_them = range(int(space.start), int(space.start + space.n))
+    if chosen is None:
+        return tuple(all_of_them)
+    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(all_of_them):
+        raise ValueError(f"actions must be different numbers in {list(all_of_them)}, got {list(chosen)}.")
+    return tuple(chosen)
+
+
+def action_names_of(env: gymnasium.Env, actions: Sequence[int]) -> tuple[str, ...]:
+    """As ALE's environments and MiniGrid's tell them; empty if the environment does not."""
+    meanings = getattr(env.unwrapped, "get_action_meanings", None)
+    if callable(meanings):
+        return tuple(str(meanings()[action]).lower() for action in actions)
+    named = getattr(env.unwrapped, "actions", None)
+    if isinstance(named, type) and issubclass(named, IntEnum):
+        return tuple(named(action).name for action in actions)
+    return ()
+
+
+def subgoals_of(given: SomeSubgoals) -> tuple[Subgoals, ...]:
+    """All sets, from near to far; names are looked up, classes are made."""
+    sets = [] if given is None else list(given) if isinstance(given, list | tuple) else [given]
+    found = [_named("subgoals", each) for each in sets]
+    made = tuple(each() if isinstance(each, type) else each for each in found)
+    for each in made:
+        if not callable(getattr(each, "conditions", None)) or not getattr(each, "names", None):
+            raise ValueError(
+                f"subgoals must have names and a method conditions, got {each!r}; derive a class from "
+                "hdrqn_torchrl.envs.gym.Subgoals."
+            )
+    prefixes = [each.prefix for each in made]
+    if made and (len(set(prefixes)) < len(made) or prefixes[-1]):
+        raise ValueError(f"subgoals must have different prefixes, and the last, farthest set none, got {prefixes}.")
+    return made
+
+
+def rule_of(name: str, rule: str | Rule | None) -> str | Rule | None:
+    """A function, or the name of an entry of ``info``; names with dots are those of functions."""
+    return _named(name, rule) if isinstance(rule, str) and "." in rule else rule
+
+
+def wrappers_of(given: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str]) -> list[Callable]:
+    """Wrappers, with names looked up."""
+    return [_named("wrappers", each) for each in given]
+
+
+def _named(argument: str, value: Any) -> Any:
+    """What a string names; anything else as it is."""
+    if not isinstance(value, str):
+        return value
+    try:
+        return pkgutil.resolve_name(value)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"{argument} must name something that can be imported, got {value!r} ({error}).") from error
+
+
+def import_package_of(id: str, package: str | None = None) -> None:
+    """Imports the package that registers an id.
+
+    Args:
+        id: of an environment.
+        package: its package; ``None``: as :data:`PACKAGES` says, which is none for environments of Gymnasium itself.
+
+    Raises:
+        ImportError: if it is missing.
+    """
+    known = [each for start, each in PACKAGES.items() if id.startswith(start)]
+    for name in [package] if package else known:
+        try:
+            gymnasium.register_envs(importlib.import_module(name))
+        except ImportError as error:
+            raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it.") from error
