@@ -161,10 +161,9 @@ class GymTaskEnv(EnvBase):
         self._entries, self._lost = entries, False
         if not entries:
             return
-        told = entries[keys.OBSERVATION]
-        self._lost = state_dict["worlds"] is None or bool(
-            (self.worlds.load_state_dict(state_dict["worlds"])[keys.OBSERVATION] != told).any()
-        )
+        told, stored = entries[keys.OBSERVATION], state_dict["worlds"]
+        shown = None if stored is None else self.worlds.load_state_dict(stored)
+        self._lost = shown is None or bool((shown[keys.OBSERVATION] != told).any())
         if self._lost:
             self.worlds.seed(zlib.crc32(told.tobytes()))  # not that of the first episodes again
             warnings.warn(

@@ -39,8 +39,8 @@ class Worlds(Protocol):
     def state_dict(self) -> dict[str, Any] | None:
         """What brings the episodes in progress back; ``None`` if nothing does."""
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> Entries:
-        """Brings them back; returns what the worlds show then."""
+    def load_state_dict(self, state: Mapping[str, Any]) -> Entries | None:
+        """Brings them back; returns what the worlds show then, or ``None`` if they cannot be brought back."""
 
 
 class OwnWorlds:
@@ -83,7 +83,17 @@ class OwnWorlds:
         return _stacked(shown)
 
 
-class GivenWorlds:
+class _WithoutState:
+    """Worlds that cannot be brought back after a restart, whatever was stored."""
+
+    def state_dict(self) -> None:
+        """See :class:`Worlds`."""
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See :class:`Worlds`."""
+
+
+class GivenWorlds(_WithoutState):
     """A vector that was made elsewhere. Its worlds cannot be looked into, nor brought back after a restart.
 
     Args:
@@ -147,15 +157,8 @@ class GivenWorlds:
                 self._begun[index] = world.begin(begun, about_begun)
         return Outcome(_stacked(self._rows), rewards, terminated, truncated & ~terminated)
 
-    def state_dict(self) -> None:
-        """See :class:`Worlds`."""
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> Entries:
-        """See :class:`Worlds`."""
-        raise NotImplementedError("the worlds of a vector that was made elsewhere cannot be brought back.")
-
-
-class PooledWorlds:
+class PooledWorlds(_WithoutState):
     """Worlds of EnvPool, which are stepped in C++. They cannot be looked into, nor brought back after a restart.
 
     Args:
@@ -192,13 +195,6 @@ class PooledWorlds:
             told = _info_of(info, index)
             self._rows[index], rewards[index] = world.step(_row(shown, index), float(reward[index]), *ends, told)
         return Outcome(_stacked(self._rows), rewards, terminated, truncated & ~terminated)
-
-    def state_dict(self) -> None:
-        """See :class:`Worlds`."""
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> Entries:
-        """See :class:`Worlds`."""
-        raise NotImplementedError("the worlds of EnvPool cannot be brought back.")
 
 
 def _row(batch: Any, index: int) -> Any:

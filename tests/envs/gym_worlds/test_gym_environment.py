@@ -146,6 +146,13 @@ class TestState:
         assert step["next", "truncated"][:, 0].all() and not step["next", "reward"][:, 0].any()
         assert not step["next", "truncated"][:, 1].any()
 
+    def test_what_worlds_of_another_kind_have_stored_is_not_brought_back(self):
+        env = make_gym(Counter, 3, seed=0)
+        env.reset()
+        given = make_gym(SyncVectorEnv([Counter] * 3, autoreset_mode=AutoresetMode.DISABLED), 3, seed=0)
+        with pytest.warns(UserWarning, match="could not be brought back"):
+            given.load_state_dict(env.state_dict())
+
     def test_another_number_of_worlds_is_refused(self):
         env = make_gym(Counter, 3)
         env.reset()
