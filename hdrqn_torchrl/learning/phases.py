@@ -70,13 +70,8 @@ class Phases:
             if each.start != 1.0:
                 raise ValueError(f"{name}_exploration.start must be 1.0 with phase_one, got {each.start}.")
         self.settings, self.explorations, self.learners = settings, explorations, learners
-        self.success = SubgoalSuccess(
-            num_subgoals,
-            window=settings.window,
-            active_subgoal_key=names.active_subgoal,
-            option_done_key=names.option_done,
-            reached_key=names.subgoal_reached,
-        ).to(explorations[-1].epsilon.device)
+        success = SubgoalSuccess(num_subgoals, window=settings.window, names=names)
+        self.success = success.to(explorations[-1].epsilon.device)
         self.frames = 0
         self._hold(True)
 

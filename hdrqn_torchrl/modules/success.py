@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from hdrqn_torchrl import keys
 from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.modules.repeating import RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.sizes import check_size
@@ -19,8 +18,8 @@ class SubgoalSuccess(nn.Module):
     Args:
         num_subgoals: G.
         window: number of options that the average goes over, or all of them while there are fewer.
-        active_subgoal_key, option_done_key, reached_key: written by
-            :class:`~hdrqn_torchrl.transforms.SubgoalTransform`, read below ``"next"``.
+        names: entries of the set of subgoals, which :class:`~hdrqn_torchrl.transforms.SubgoalTransform` writes below
+            ``"next"``.
 
     Raises:
         ValueError: if a number is not positive.
@@ -45,15 +44,13 @@ class SubgoalSuccess(nn.Module):
         num_subgoals: int,
         *,
         window: int = 100,
-        active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
-        option_done_key: NestedKey = keys.OPTION_DONE,
-        reached_key: NestedKey = keys.SUBGOAL_REACHED,
+        names: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
     ) -> None:
         super().__init__()
         for name, value, usual in (("num_subgoals", num_subgoals, 6), ("window", window, 100)):
             check_size(name, value, usual)
         self.window = window
-        self._keys = [("next", key) for key in (active_subgoal_key, option_done_key, reached_key)]
+        self._keys = [("next", key) for key in (names.active_subgoal, names.option_done, names.subgoal_reached)]
         self.register_buffer("rates", torch.zeros(num_subgoals))
         self.register_buffer("options", torch.zeros(num_subgoals, dtype=torch.int64))
 
@@ -115,13 +112,7 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
 
     def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys = OptionKeys()) -> None:  # noqa: B008 (frozen)
         """Must be called before it chooses; the policies that explore with it do."""
-        self.success = SubgoalSuccess(
-            num_subgoals,
-            window=self.window,
-            active_subgoal_key=names.active_subgoal,
-            option_done_key=names.option_done,
-            reached_key=names.subgoal_reached,
-        )
+        self.success = SubgoalSuccess(num_subgoals, window=self.window, names=names)
 
     def observe(self, batch: TensorDictBase) -> None:
         """Learns from a collected batch how often subgoals were reached."""
