@@ -10,10 +10,16 @@ from pathlib import Path
 from typing import Protocol
 
 import matplotlib
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, ImageFont
 from rich.text import Text
 
 Colour = tuple[int, int, int]
+
+_COLOURS: tuple[Colour, ...] = (
+    (230, 159, 0), (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (0, 114, 178),
+)  # fmt: skip  # Okabe and Ito
 
 
 class Scene(Protocol):
@@ -56,3 +62,28 @@ def font(size: int, *, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, which comes with matplotlib."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name, size)
+
+
+def colours(number: int) -> tuple[Colour, ...]:
+    """Colours that can be told apart; after six they begin anew.
+
+    Args:
+        number: of subgoals or whatever has a colour each.
+    """
+    return tuple(_COLOURS[index % len(_COLOURS)] for index in range(number))
+
+
+def fitted(
+    picture: NDArray[np.uint8], size: int, *, resampling: Image.Resampling = Image.Resampling.NEAREST
+) -> Image.Image:
+    """A picture whose longer side has ``size`` pixels.
+
+    Args:
+        picture: ``[height, width, 3]``.
+        size: in pixels.
+        resampling: the default keeps the edges of its own pixels.
+    """
+    image = Image.fromarray(picture)
+    scale = size / max(image.size)
+    width, height = (max(1, round(side * scale)) for side in image.size)
+    return image.resize((width, height), resampling)

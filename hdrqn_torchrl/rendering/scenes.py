@@ -15,11 +15,8 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs import Task, task_of
-from hdrqn_torchrl.envs.scene import Colour, Scene, font
+from hdrqn_torchrl.envs.scene import Colour, Scene, colours, fitted, font
 
-_COLOURS: tuple[Colour, ...] = (
-    (230, 159, 0), (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (0, 114, 178),
-)  # fmt: skip  # Okabe and Ito
 _INK, _PAPER = (30, 30, 30), (255, 255, 255)
 _LONGEST_LINE, _MOST_LINES = 60, 24
 
@@ -87,7 +84,7 @@ class PlainScene:
     @property
     def subgoal_colours(self) -> tuple[Colour, ...]:
         """One for each, in turn."""
-        return tuple(_COLOURS[index % len(_COLOURS)] for index in range(len(self.subgoal_names)))
+        return colours(len(self.subgoal_names))
 
     def outcome(self, success: bool, terminated: bool) -> str:
         """How an episode ended."""
@@ -96,13 +93,13 @@ class PlainScene:
     def draw_world(self, size: int) -> Image.Image:
         """What the environment renders or, failing that, what the agent sees."""
         if isinstance(self.rendered, np.ndarray):
-            return _fitted(Image.fromarray(self.rendered), size)
+            return fitted(self.rendered, size)
         return _written(self.write_world().plain, size)
 
     def draw_view(self, size: int) -> Image.Image:
         """The observation as a picture if it is one, else in numbers."""
         if (picture := _as_picture(self.observation)) is not None:
-            return _fitted(Image.fromarray(picture), size)
+            return fitted(picture, size)
         return _written(self.write_view().plain, size)
 
     def write_world(self) -> Text:
@@ -139,12 +136,6 @@ def _as_picture(observation: NDArray | None) -> NDArray[np.uint8] | None:
     if observation.shape[0] == 3:
         observation = observation.transpose(1, 2, 0)
     return np.ascontiguousarray(observation) if observation.shape[-1] == 3 else None
-
-
-def _fitted(image: Image.Image, size: int) -> Image.Image:
-    scale = size / max(image.size)
-    shape = tuple(max(1, round(side * scale)) for side in image.size)
-    return image.resize(shape, Image.Resampling.NEAREST)  # type: ignore[arg-type]
 
 
 def _written(text: str, size: int) -> Image.Image:

@@ -10,11 +10,9 @@ from PIL import Image
 from rich.text import Text
 from torchrl.envs import EnvBase
 
-from hdrqn_torchrl.envs.scene import Colour
+from hdrqn_torchrl.envs.scene import Colour, colours, fitted
 
-_COLOURS: tuple[Colour, ...] = (
-    (230, 159, 0), (86, 180, 233), (0, 158, 115), (213, 94, 0), (204, 121, 167), (0, 114, 178),
-)  # fmt: skip  # Okabe and Ito
+_SMOOTH = Image.Resampling.LANCZOS
 _TILE = 32  # pixels
 
 
@@ -50,7 +48,7 @@ class MiniGridScene:
     @property
     def subgoal_colours(self) -> tuple[Colour, ...]:
         """One for each, in turn."""
-        return tuple(_COLOURS[index % len(_COLOURS)] for index in range(len(self.subgoal_names)))
+        return colours(len(self.subgoal_names))
 
     def outcome(self, success: bool, terminated: bool) -> str:
         """How an episode ended."""
@@ -58,11 +56,11 @@ class MiniGridScene:
 
     def draw_world(self, size: int) -> Image.Image:
         """The whole map."""
-        return _fitted(self.picture, size)
+        return fitted(self.picture, size, resampling=_SMOOTH)
 
     def draw_view(self, size: int) -> Image.Image:
         """What the agent sees."""
-        return _fitted(self.seen, size)
+        return fitted(self.seen, size, resampling=_SMOOTH)
 
     def write_world(self) -> Text:
         """The map in characters, and the mission."""
@@ -71,9 +69,3 @@ class MiniGridScene:
     def write_view(self) -> Text:
         """The map in characters; MiniGrid does not write what the agent sees."""
         return self.write_world()
-
-
-def _fitted(picture: NDArray[np.uint8], size: int) -> Image.Image:
-    scale = size / max(picture.shape[:2])
-    width, height = (max(1, round(side * scale)) for side in (picture.shape[1], picture.shape[0]))
-    return Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
