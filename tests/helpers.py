@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from tensordict import TensorDictBase
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, TransformedEnv
+from torchrl.envs import Compose, EnvBase, InitTracker, TransformedEnv
 
 from hdrqn_torchrl.algorithms import Algorithm, make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import MultiGoalGridEnv
@@ -111,7 +111,7 @@ def make_training(
     seed: int = 0,
     learner: dict | None = None,
     options: dict | None = None,
-    worlds: Callable[..., MultiGoalGridEnv] = small_env,
+    worlds: Callable[..., EnvBase] = small_env,
     **settings,
 ) -> Trainer:
     """A complete training, so small that its memories wrap and dozens of episodes end within 256 frames.

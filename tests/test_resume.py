@@ -8,13 +8,26 @@ from dataclasses import dataclass
 from functools import cache, partial
 
 import pytest
+import torch
 from helpers import check_same, check_same_checkpoint, house, make_training, seed_everything, table
 
+from hdrqn_torchrl.envs import make_gym, make_minigrid
 from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.interruption import Interrupted
 
 BATCH = 32  # frames; see make_training
+
+
+def door_and_key(num_envs, seed=0):
+    pytest.importorskip("minigrid")
+    return make_minigrid("MiniGrid-DoorKey-5x5-v0", num_envs, max_steps=7, seed=seed)
+
+
+def cart_and_pole(num_envs, seed=0):
+    return make_gym("CartPole-v1", num_envs, max_steps=7, seed=seed)
+
+
 TRAININGS = {
     "drqn": partial(make_training, name="drqn", learner={"sampling": "episodes", "max_grad_norm": 0.5}),
     "v1": partial(
@@ -49,6 +62,8 @@ TRAININGS = {
         name="v3",
         learner={"sampling": "steps", "stored_state": True, "priority_exponent": 0.9, "burn_in": 0.25, "slice_len": 4},
     ),
+    "drqn-gymnasium": partial(make_training, name="drqn", worlds=cart_and_pole),
+    "v3-minigrid": partial(make_training, name="v3", worlds=door_and_key),
 }
 
 
@@ -115,8 +130,15 @@ def owed(trainer, *, number, dues):
     assert level(trainer, number).state_dict()["drawn"]
 
 
+def steps_in_episodes(env):
+    """How many steps the episode in progress has, for each world."""
+    if hasattr(env, "steps"):
+        return env.steps
+    return torch.tensor([len(moment["actions"]) for moment in env.worlds.vector.get_attr("moment")])
+
+
 def options_in_progress(trainer):
-    steps = trainer.collector.env.base_env.steps
+    steps = steps_in_episodes(trainer.collector.env.base_env)
     assert ((steps > 0) & (steps < 7)).any()
     assert trainer.state_dict()["tracker"]["sums"]["steps"].tolist() == steps.tolist()
     if len(trainer.algorithm.learners) > 1:
@@ -155,6 +177,7 @@ PAIRS += [(training, "in the middle of options") for training in ("v1-three-leve
 PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of metrics", *FEW[1:])]
 PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole", "levels"))]
 PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
+PAIRS += [(training, "in the middle of options") for training in ("drqn-gymnasium", "v3-minigrid")]
 
 
 @pytest.fixture(scope="module")
