@@ -7,7 +7,9 @@ pytest.importorskip("minigrid")
 
 from hdrqn_torchrl.envs import check_task, make_minigrid
 from hdrqn_torchrl.envs.gym import Subgoals
+from hdrqn_torchrl.envs.gym.minigrid import making
 from hdrqn_torchrl.envs.gym.minigrid.bot import bot_can_play, play
+from hdrqn_torchrl.envs.gym.minigrid.survey import survey
 from hdrqn_torchrl.rendering import scene_of
 
 LEFT, RIGHT, FORWARD, PICKUP, DROP, TOGGLE = range(6)
@@ -98,6 +100,20 @@ class TestObservation:
         assert env.observation_spec.is_in(
             env.rollout(200, break_when_any_done=False).exclude("action")[:, -1].select(*env.observation_spec.keys())
         )
+
+
+def test_a_process_looks_at_a_task_s_episodes_once_for_all_environments_with_the_same_settings(monkeypatch):
+    looks = []
+    monkeypatch.setattr(making, "survey", lambda env: (looks.append(env.spec.id), survey(env))[1])
+    making._looked.cache_clear()
+    first, again = (names("MiniGrid-DoorKey-5x5-v0", max_steps=50) for _ in range(2))
+    assert first == again and len(looks) == 1
+    make_minigrid("MiniGrid-DoorKey-5x5-v0", 1, max_steps=51)
+    make_minigrid("MiniGrid-Empty-5x5-v0", 1)
+    assert len(looks) == 3
+    for _ in range(2):  # a list has no hash
+        make_minigrid("BabyAI-BossLevel-v0", 1, settings={"action_kinds": ["goto"]})
+    assert len(looks) == 5
 
 
 def test_keeps_the_contract_of_tasks():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import gymnasium
@@ -104,6 +104,17 @@ def make_minigrid(
 
 def _look(id: str, options: Mapping[str, Any]) -> tuple[Survey, bool]:
     """What occurs in the task, and whether the bot can play it."""
+    stated = tuple(sorted(options.items()))
+    try:
+        hash(stated)
+    except TypeError:  # a list among them
+        return _looked.__wrapped__(id, stated)
+    return _looked(id, stated)
+
+
+@cache  # the episodes that it looks at are always the same
+def _looked(id: str, stated: tuple[tuple[str, Any], ...]) -> tuple[Survey, bool]:
+    options = dict(stated)
     try:
         env = gymnasium.make(id, **options)
     except gymnasium.error.Error as error:
