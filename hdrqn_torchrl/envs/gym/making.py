@@ -253,11 +253,13 @@ def _pooled(id: str | EnvFactory, num_envs: int, read: Callable, settings: Mappi
         raise ImportError("backend='envpool' needs EnvPool: pip install 'hdrqn_torchrl[envpool]'.") from error
     if not isinstance(id, str) or id not in envpool.list_all_envs():
         raise ValueError(f"id must be one that EnvPool has, got {id!r}; use backend='gymnasium'.")
-    make = partial(_pool, id, num_envs, dict(settings))
-    pool = make(0)
-    reading, actions = read(pool.observation_space, pool.action_space, masked=False)
-    limit = pool.spec.config.max_episode_steps
-    worlds = PooledWorlds(make, pool, reading, num_envs)
+    try:
+        spec = envpool.make_spec(id, num_envs=num_envs, seed=0, **settings)
+    except TypeError as error:
+        raise ValueError(f"settings must be arguments that {id} takes, got {sorted(settings)} ({error}).") from error
+    reading, actions = read(spec.gymnasium_observation_space, spec.gymnasium_action_space, masked=False)
+    limit = spec.config.max_episode_steps
+    worlds = PooledWorlds(partial(_pool, id, num_envs, dict(settings)), reading, num_envs)
     return _Made(worlds=worlds, reading=reading, actions=actions, max_steps=limit if 0 < limit < 2**31 - 1 else None)
 
 

@@ -163,19 +163,20 @@ class PooledWorlds(_WithoutState):
 
     Args:
         make: makes a pool for a seed, with Gymnasium's interface.
-        pool: the first one.
         reading: how entries are read.
         num_envs: N.
     """
 
-    def __init__(self, make: Callable[[int], Any], pool: Any, reading: Reading, num_envs: int) -> None:
-        self._make, self.pool = make, pool
+    def __init__(self, make: Callable[[int], Any], reading: Reading, num_envs: int) -> None:
+        self._make = make
+        self.pool: Any = None  # until there is a seed
         self._worlds = [World(reading) for _ in range(num_envs)]
         self._rows: list[Entries] = [{} for _ in self._worlds]
 
     def seed(self, seed: int) -> None:
         """See :class:`Worlds`. A pool takes a seed only when it is made."""
-        self.pool.close()
+        if self.pool is not None:
+            self.pool.close()
         self.pool = self._make(seed % _LARGEST_SEED)
 
     def reset(self, mask: Mask) -> Entries:
