@@ -70,9 +70,12 @@ class OwnWorlds:
         entries, reward, terminated, truncated, _ = self.vector.step(actions)
         return Outcome(entries, reward.astype(np.float32), terminated, truncated)
 
-    def state_dict(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any] | None:
         """See :class:`Worlds`."""
-        return {"moments": list(self.vector.get_attr("moment")), "generator": self._generator.bit_generator.state}
+        moments = list(self.vector.get_attr("moment"))
+        if any(moment is None for moment in moments):
+            return None
+        return {"moments": moments, "generator": self._generator.bit_generator.state}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> Entries:
         """See :class:`Worlds`."""

@@ -21,6 +21,8 @@ from hdrqn_torchrl.envs.gym.subgoals import SubgoalRecord, Subgoals
 Entries = dict[str, NDArray]
 _BOOL: Any = np.bool_  # which Gymnasium's annotations leave out
 Rule = Callable[[float, Mapping[str, Any]], float]
+MOST_ACTIONS = 10_000
+"""A longer episode cannot be brought back by its actions: they would be kept, and repeated, without bound."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,9 +137,10 @@ def _action_mask(info: Mapping[str, Any], actions: tuple[int, ...]) -> NDArray[n
 class WorldWrapper(gymnasium.Wrapper):
     """A world of Gymnasium's whose observations are all entries that agents read, and that can be brought back.
 
-    An episode in progress is known by its seed and its actions: an environment that draws all its random numbers from
-    the generator that ``reset(seed=...)`` seeds comes back if the same is done again. One that has ``state_dict`` and
-    ``load_state_dict`` itself, behind no wrappers but those that ``gymnasium.make`` adds, comes back with these.
+    An episode in progress is known by its seed and its actions, up to :data:`MOST_ACTIONS` of them: an environment that
+    draws all its random numbers from the generator that ``reset(seed=...)`` seeds comes back if the same is done again.
+    One that has ``state_dict`` and ``load_state_dict`` itself, behind no wrappers but those that ``gymnasium.make``
+    adds, comes back with these.
 
     Args:
         env: one world.
@@ -151,7 +154,7 @@ class WorldWrapper(gymnasium.Wrapper):
         self.entries: Entries = {}
         self._state = EnvState(env) if EnvState.is_offered(env) else None
         self._seed: int | None = None
-        self._actions: list[int] = []
+        self._actions: list[int] | None = []  # None: there were too many
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -165,15 +168,23 @@ class WorldWrapper(gymnasium.Wrapper):
     def step(self, action: int) -> tuple[Entries, float, bool, bool, dict[str, Any]]:
         """One step; see :class:`gymnasium.Env`. An episode that terminates is not truncated."""
         if self._state is None:
-            self._actions.append(int(action))
+            self._keep(int(action))
         observation, reward, terminated, truncated, info = self.env.step(action)
         self.entries, reward = self.world.step(observation, float(reward), bool(terminated), bool(truncated), info)
         return self.entries, reward, bool(terminated), bool(truncated and not terminated), {}
 
+    def _keep(self, action: int) -> None:
+        if self._actions is not None and len(self._actions) < MOST_ACTIONS:
+            self._actions.append(action)
+        else:
+            self._actions = None
+
     @property
-    def moment(self) -> dict[str, Any]:
-        """What brings the episode in progress back."""
+    def moment(self) -> dict[str, Any] | None:
+        """What brings the episode in progress back; ``None`` if it is too long for that."""
         if self._state is None:
+            if self._actions is None:
+                return None
             seed = -1 if self._seed is None else self._seed
             return {"seed": seed, "actions": torch.tensor(self._actions, dtype=torch.int32)}
         shown = self.env.observation_space.to_jsonable([self.world.shown])

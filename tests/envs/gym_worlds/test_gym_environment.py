@@ -8,6 +8,7 @@ from gymnasium.wrappers import TimeLimit
 from torchrl.envs.utils import check_env_specs
 
 from hdrqn_torchrl.envs import check_task, make_gym
+from hdrqn_torchrl.envs.gym import worlds
 
 STEPS = 40
 
@@ -145,6 +146,22 @@ class TestState:
         assert torch.equal(step["next", "observation"][:, 0], tensordict["observation"])
         assert step["next", "truncated"][:, 0].all() and not step["next", "reward"][:, 0].any()
         assert not step["next", "truncated"][:, 1].any()
+
+    def test_an_episode_of_too_many_actions_is_cut_off_and_the_next_one_is_brought_back(self, monkeypatch):
+        monkeypatch.setattr(worlds, "MOST_ACTIONS", 5)
+        env = make_gym(lambda: Counter(ends=False), 2, seed=0)
+        bare = "observation", "done", "terminated", "truncated"
+        tensordict = go_on(env, env.reset(), 5)[:, -1]["next"].select(*bare)
+        go_on(env, tensordict.clone(), 1)
+        assert env.state_dict()["worlds"] is None
+        with pytest.warns(UserWarning, match="could not be brought back"):
+            env.load_state_dict(env.state_dict())
+        assert go_on(env, tensordict, 1)["next", "truncated"].all()
+        tensordict = go_on(env, env.reset(), 5)[:, -1]["next"].select(*bare)
+        state = env.state_dict()
+        expected = go_on(env, tensordict.clone(), 2)
+        env.load_state_dict(state)
+        assert torch.equal(go_on(env, tensordict.clone(), 2)["next", "observation"], expected["next", "observation"])
 
     def test_what_worlds_of_another_kind_have_stored_is_not_brought_back(self):
         env = make_gym(Counter, 3, seed=0)
