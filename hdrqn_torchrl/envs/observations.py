@@ -11,9 +11,11 @@ from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, OneHot,
 
 ObservationKind = Literal["cells", "codes", "image", "vector"]
 
-_LARGEST_FLOAT = 10.0  # images in float32 with bounds above this are not taken to be scaled to about 1
+LARGEST_FLOAT = 10.0
+"""Images in float32 with bounds above this are not taken to be scaled to about 1."""
+MOST_COLOURS = 4
+"""An end of an image's shape that is no larger is taken for its channels."""
 _MOST_CODES = 1_000_000  # of all entries of a vector of bounded integers; it has as many rows of weights
-_MOST_COLOURS = 4  # an image whose last dimension is no larger has its channels there
 READABLE = (
     "a square of cell codes [V, V] (Categorical, integers), other codes (a Bounded vector of integers from 0, "
     "Categorical or MultiCategorical), an image [channels, height, width] (uint8, or float32 of about 1) or a vector "
@@ -102,12 +104,12 @@ def _is_image(spec: TensorSpec, shape: Sequence[int]) -> bool:
     if _has_channels_last(shape):
         return False
     if spec.dtype == torch.float32:
-        return not isinstance(spec, Bounded) or bool(spec.space.high.max() <= _LARGEST_FLOAT)
+        return not isinstance(spec, Bounded) or bool(spec.space.high.max() <= LARGEST_FLOAT)
     return spec.dtype == torch.uint8
 
 
 def _has_channels_last(shape: Sequence[int]) -> bool:
-    return shape[-1] <= _MOST_COLOURS < min(shape[0], shape[1])
+    return shape[-1] <= MOST_COLOURS < min(shape[0], shape[1])
 
 
 def _remedy(spec: TensorSpec, shape: Sequence[int]) -> str:
@@ -115,7 +117,10 @@ def _remedy(spec: TensorSpec, shape: Sequence[int]) -> str:
     if spec.dtype == torch.float64:
         return "cast it to float32, for instance with DoubleToFloat"
     if len(shape) == 3 and _has_channels_last(shape):
-        return "put the channels first, for instance with ToTensorImage or PermuteTransform"
+        return (
+            "put the channels first, for instance with ToTensorImage or PermuteTransform (where they are first, "
+            "exchange height and width)"
+        )
     if len(shape) == 3 and spec.dtype == torch.float32:
         return "divide it by its largest value, for instance with ToTensorImage"
     if len(shape) == 2:

@@ -47,6 +47,7 @@ def test_what_built_in_networks_take_an_observation_for(spec, kind):
         (Bounded(0, 2**30, shape=(N, 4), dtype=torch.int64), "cast it to float32 if it holds quantities"),
         (Bounded(0, 255, shape=(N, 44, 44), dtype=torch.uint8), "UnsqueezeTransform"),
         (Bounded(0, 255, shape=(N, 44, 60, 3), dtype=torch.uint8), "put the channels first"),
+        (Bounded(0, 255, shape=(N, 6, 10, 4), dtype=torch.uint8), "(where they are first, exchange height and width)"),
         (Bounded(0, 255, shape=(N, 3, 44, 44), dtype=torch.float32), "divide it by its largest value"),
         (Unbounded(shape=(N,)), "flatten it"),
     ],

@@ -25,7 +25,7 @@ from hdrqn_torchrl.envs.gym.arguments import (
     wrappers_of,
 )
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
-from hdrqn_torchrl.envs.gym.observations import make_encoder
+from hdrqn_torchrl.envs.gym.observations import Channels, make_encoder
 from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
 from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper
 from hdrqn_torchrl.envs.task import Task
@@ -42,6 +42,7 @@ def make_gym(
     package: str | None = None,
     wrappers: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str] = (),
     entries: Sequence[str] | None = None,
+    channels: Channels | None = None,
     codes: int | Sequence[int] | None = None,
     words: Sequence[str] | None = None,
     text_length: int = 16,
@@ -73,7 +74,8 @@ def make_gym(
         package: that registers the id when it is imported, if it is none of
             :data:`~hdrqn_torchrl.envs.gym.arguments.PACKAGES`.
         wrappers: put around every world, the first one innermost.
-        entries, codes, words, text_length: of observations; see :func:`~hdrqn_torchrl.envs.gym.make_encoder`.
+        entries, channels, codes, words, text_length: of observations; see
+            :func:`~hdrqn_torchrl.envs.gym.make_encoder`.
         actions: numbers of the actions that the agent has; ``None``: all.
         reward: in place of the environment's own: an entry of ``info``, or a function of (reward, info).
         success: whether a step completed the task, likewise; the function's ``info`` also has ``reward``,
@@ -83,7 +85,7 @@ def make_gym(
         largest_return: of an episode, if known: it bounds the targets.
         smallest_return: likewise.
         backend: ``"envpool"`` steps the worlds in C++, if it has the id: ``pip install 'hdrqn_torchrl[envpool]'``. Its
-            worlds can't be looked into, and a resumed training begins new episodes.
+            worlds can't be looked into, all actions count as available, and a resumed training begins new episodes.
         processes: each world has a process of its own.
         seed: of all episodes; ``None`` draws one from torch's global generator.
         device: device of all tensors.
@@ -102,7 +104,7 @@ def make_gym(
     read = partial(
         _read,
         actions=actions,
-        options={"entries": entries, "codes": codes, "words": words, "text_length": text_length},
+        options={"entries": entries, "channels": channels, "codes": codes, "words": words, "text_length": text_length},
         rest={
             "subgoals": subgoals_of(subgoals),
             **{key: rule_of(key, rule) for key, rule in (("reward", reward), ("success", success), ("hazard", hazard))},

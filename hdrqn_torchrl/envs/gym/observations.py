@@ -9,7 +9,8 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,8 +18,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
-_MOST_CHANNELS = 4  # of an image whose order is not told
-_LARGEST_FLOAT = 10.0  # images of floats are of about 1
+from hdrqn_torchrl.envs.observations import LARGEST_FLOAT, MOST_COLOURS
+
+Channels = Literal["first", "last"]
 _HASHED_WORDS = 255
 
 
@@ -57,6 +59,7 @@ def make_encoder(
     space: spaces.Space,
     *,
     entries: Sequence[str] | None = None,
+    channels: Channels | None = None,
     codes: int | Sequence[int] | None = None,
     words: Sequence[str] | None = None,
     text_length: int = 16,
@@ -64,8 +67,8 @@ def make_encoder(
     """Chooses how observations of a space become one tensor.
 
     - ``Discrete``, ``MultiDiscrete`` and ``MultiBinary`` are codes.
-    - A ``Box`` of bytes with three dimensions (or of floats of about 1) is an image; channels first or last, whichever
-      end is at most 4. With two dimensions it is an image of one channel. Any other ``Box`` is a vector of floats.
+    - A ``Box`` of bytes with three dimensions (or of floats of about 1) is an image. With two dimensions it is an image
+      of one channel. Any other ``Box`` is a vector of floats.
     - With ``codes``, a ``Box`` of integers holds codes: a square ``[V, V]`` is a window of cells, anything else becomes
       a vector of codes.
     - A ``Text`` is a sequence of codes, one for each word.
@@ -75,12 +78,14 @@ def make_encoder(
     Args:
         space: of the environment's observations.
         entries: of a ``Dict``, those that the agent sees, in this order; ``None``: all of them.
+        channels: whether images have their channels ``"first"`` or ``"last"``; ``None``: at the end that is at most 4.
         codes: number of codes of a ``Box`` of integers; a list has one number for each plane, the last dimension.
         words: of texts, numbered from 1; others are 0. ``None``: words are numbered by a checksum below 255.
         text_length: number of words of a text that are seen.
 
     Raises:
-        ValueError: if there is no such entry, or the space is none of these.
+        ValueError: if there is no such entry, the space is none of these, or an image's shape does not tell where its
+            channels are.
 
     Examples:
         >>> make_encoder(spaces.Box(0, 255, (210, 160, 3), np.uint8)).space.shape
@@ -92,6 +97,8 @@ def make_encoder(
     """
     if text_length < 1:
         raise ValueError(f"text_length must be >= 1, got {text_length}; 16 words are usual.")
+    if channels not in (None, "first", "last"):
+        raise ValueError(f"channels must be 'first', 'last' or None, got {channels!r}.")
     parts: list[tuple[Any, spaces.Space]]
     if isinstance(space, spaces.Dict):
         names = list(space) if entries is None else list(entries)
@@ -104,13 +111,17 @@ def make_encoder(
     elif isinstance(space, spaces.Tuple):
         parts = list(enumerate(space.spaces))
     else:
-        return _encoder_of(space, codes, words, text_length)
-    encoders = {name: make_encoder(part, codes=codes, words=words, text_length=text_length) for name, part in parts}
-    return _joined(encoders)
+        return _encoder_of(space, channels, codes, words, text_length)
+    make = partial(make_encoder, channels=channels, codes=codes, words=words, text_length=text_length)
+    return _joined({name: make(part) for name, part in parts})
 
 
 def _encoder_of(
-    space: spaces.Space, codes: int | Sequence[int] | None, words: Sequence[str] | None, text_length: int
+    space: spaces.Space,
+    channels: Channels | None,
+    codes: int | Sequence[int] | None,
+    words: Sequence[str] | None,
+    text_length: int,
 ) -> Encoder:
     """Of a space that is not made of others."""
     if isinstance(space, spaces.Discrete):
@@ -124,7 +135,7 @@ def _encoder_of(
     if isinstance(space, spaces.Text) or (space.dtype is not None and space.dtype.kind == "U"):  # MiniGrid's missions
         return _words(words, text_length)
     if isinstance(space, spaces.Box):
-        return _box(space) if codes is None or space.dtype.kind not in "iu" else _box_of_codes(space, codes)
+        return _box(space, channels) if codes is None or space.dtype.kind not in "iu" else _box_of_codes(space, codes)
     raise ValueError(
         f"observation space must be a Box, Discrete, MultiDiscrete, MultiBinary, Text, Dict or Tuple, got {space}; "
         "turn it into one of them with a wrapper (gymnasium.wrappers.TransformObservation)."
@@ -156,14 +167,14 @@ def _words(words: Sequence[str] | None, length: int) -> Encoder:
     return _codes(np.full(length, number), encode)
 
 
-def _box(space: spaces.Box) -> Encoder:
+def _box(space: spaces.Box, channels: Channels | None) -> Encoder:
     shape, is_byte = space.shape, space.dtype == np.uint8
-    about_one = bool(np.isfinite(space.high).all() and space.high.max() <= _LARGEST_FLOAT)
+    about_one = bool(np.isfinite(space.high).all() and space.high.max() <= LARGEST_FLOAT)
     if len(shape) == 2 and is_byte:
         return _image((1, *shape), np.dtype(np.uint8), lambda value: np.asarray(value)[None])
     if len(shape) == 3 and (is_byte or (np.issubdtype(space.dtype, np.floating) and about_one)):
         dtype = np.dtype(np.uint8) if is_byte else np.dtype(np.float32)
-        if shape[-1] <= _MOST_CHANNELS < shape[0]:
+        if (channels or _place_of_channels(shape)) == "last":
             order = (shape[2], *shape[:2])
             return _image(order, dtype, lambda value: np.ascontiguousarray(np.moveaxis(np.asarray(value), -1, 0)))
         return _image(shape, dtype, np.asarray)
@@ -174,9 +185,19 @@ def _box(space: spaces.Box) -> Encoder:
     )
 
 
+def _place_of_channels(shape: Sequence[int]) -> Channels:
+    first, last = (shape[end] <= MOST_COLOURS for end in (0, -1))
+    if first == last:
+        raise ValueError(
+            f"channels must be 'first' or 'last' for images of shape {list(shape)}, which does not tell where its "
+            "channels are, got None."
+        )
+    return "first" if first else "last"
+
+
 def _image(shape: tuple[int, ...], dtype: np.dtype, encode: Callable[[Any], NDArray]) -> Encoder:
-    high = 255 if dtype == np.uint8 else _LARGEST_FLOAT
-    low = 0 if dtype == np.uint8 else -_LARGEST_FLOAT
+    high = 255 if dtype == np.uint8 else LARGEST_FLOAT
+    low = 0 if dtype == np.uint8 else -LARGEST_FLOAT
     return Encoder(
         encode=lambda value: encode(value).astype(dtype, copy=False), space=spaces.Box(low, high, shape, dtype.type)
     )

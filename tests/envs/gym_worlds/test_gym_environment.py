@@ -4,7 +4,7 @@ import pytest
 import torch
 from gym_toys import Counter, CountingResets, Forgetful, Milestones, Remembering
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import TimeLimit, TransformObservation
 from torchrl.envs.utils import check_env_specs
 
 from hdrqn_torchrl.envs import check_task, make_gym
@@ -82,6 +82,16 @@ def test_the_same_seed_gives_the_same_worlds_and_another_seed_others():
     first, again, other = (played(make_gym(Counter, 3, seed=seed)) for seed in (0, 0, 1))
     assert torch.equal(first["observation"], again["observation"])
     assert not torch.equal(first["observation"], other["observation"])
+
+
+def test_images_can_have_their_channels_at_either_end():
+    def paint(env):
+        space = gymnasium.spaces.Box(0, 255, (9, 8, 7), np.uint8)
+        return TransformObservation(env, lambda shown: np.full(space.shape, shown[0], np.uint8), space)
+
+    for channels, shape in (("first", (9, 8, 7)), ("last", (7, 9, 8))):
+        env = make_gym(Counter, 2, wrappers=[paint], channels=channels)
+        assert env.reset()["observation"].shape == env.observation_spec["observation"].shape == (2, *shape)
 
 
 class TestRules:

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -28,6 +30,21 @@ def test_channels_are_moved_not_reshaped():
     image = np.zeros((6, 5, 3), np.uint8)
     image[2, 4, 1] = 9
     assert make_encoder(spaces.Box(0, 255, (6, 5, 3), np.uint8)).encode(image)[1, 2, 4] == 9
+
+
+@pytest.mark.parametrize(("shape", "channels"), [((8, 10, 4), "first"), ((4, 20, 3), "last"), ((84, 80, 6), "last")])
+def test_images_have_their_channels_where_the_user_says(shape, channels):
+    image = np.arange(np.prod(shape), dtype=np.int64).astype(np.uint8).reshape(shape)
+    encoder = make_encoder(spaces.Dict({"image": spaces.Box(0, 255, shape, np.uint8)}), channels=channels)
+    expected = image if channels == "first" else image.transpose(2, 0, 1)
+    assert encoder.space.shape == expected.shape and (encoder.encode({"image": image}) == expected).all()
+
+
+@pytest.mark.parametrize("shape", [(84, 80, 6), (12, 5, 5), (4, 20, 3)])
+def test_an_image_whose_shape_does_not_tell_where_its_channels_are_is_refused(shape):
+    words = f"channels must be 'first' or 'last' for images of shape {list(shape)}, which does not tell"
+    with pytest.raises(ValueError, match=re.escape(words)):
+        make_encoder(spaces.Box(0, 255, shape, np.uint8))
 
 
 def test_images_of_floats_about_1_stay_images():
@@ -129,6 +146,7 @@ class TestDict:
     [
         (spaces.Dict({"a": spaces.Discrete(2)}), {"entries": ["b"]}, r"entries must be some of \['a'\], got \['b'\]"),
         (SCREEN, {"entries": ["b"]}, "entries must be None for observations that are no Dict"),
+        (SCREEN, {"channels": "middle"}, "channels must be 'first', 'last' or None, got 'middle'"),
         (PLANES, {"codes": (11, 6)}, r"codes must be one number >= 1, or one for each of 3 planes .* got \(11, 6\)"),
         (PLANES, {"codes": 0}, "codes must be one number >= 1"),
         (spaces.Text(3), {"text_length": 0}, "text_length must be >= 1, got 0"),
