@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
 from typing import Any
 
@@ -106,3 +106,29 @@ def import_package_of(id: str, package: str | None = None) -> None:
             gymnasium.register_envs(importlib.import_module(name))
         except ImportError as error:
             raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it.") from error
+
+
+def make_world(
+    id: str, settings: Mapping[str, Any], *, what: str = "an environment that Gymnasium knows"
+) -> gymnasium.Env:
+    """One world of a registered environment.
+
+    Args:
+        id: of the environment.
+        settings: keyword arguments for ``gymnasium.make``.
+        what: what the id has to be that of.
+
+    Raises:
+        ValueError: if there is no such environment, or it does not take the settings.
+    """
+    try:
+        return gymnasium.make(id, **settings)
+    except gymnasium.error.Error as error:
+        raise ValueError(f"id must be that of {what}, got {id!r} ({error}).") from error
+    except TypeError as error:
+        raise settings_error(id, settings, error) from error
+
+
+def settings_error(id: str, settings: Mapping[str, Any], error: TypeError) -> ValueError:
+    """What to say of settings that an environment does not take."""
+    return ValueError(f"settings must be arguments that {id} takes, got {sorted(settings)} ({error}).")

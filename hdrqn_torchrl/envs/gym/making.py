@@ -20,7 +20,9 @@ from hdrqn_torchrl.envs.gym.arguments import (
     action_names_of,
     actions_of,
     import_package_of,
+    make_world,
     rule_of,
+    settings_error,
     subgoals_of,
     wrappers_of,
 )
@@ -217,12 +219,7 @@ def _factory(
 
 
 def _registered(id: str, settings: Mapping[str, Any], max_steps: int | None, **more: Any) -> gymnasium.Env:
-    try:
-        return gymnasium.make(id, **{**settings, **more}, **_limit(max_steps))
-    except gymnasium.error.Error as error:
-        raise ValueError(f"id must be that of an environment that Gymnasium knows, got {id!r} ({error}).") from error
-    except TypeError as error:
-        raise ValueError(f"settings must be arguments that {id} takes, got {sorted(settings)} ({error}).") from error
+    return make_world(id, {**settings, **more, **_limit(max_steps)})
 
 
 def _limited(make: EnvFactory, max_steps: int | None, **_: Any) -> gymnasium.Env:
@@ -258,7 +255,7 @@ def _pooled(id: str | EnvFactory, num_envs: int, read: Callable, settings: Mappi
     try:
         spec = envpool.make_spec(id, num_envs=num_envs, seed=0, **settings)
     except TypeError as error:
-        raise ValueError(f"settings must be arguments that {id} takes, got {sorted(settings)} ({error}).") from error
+        raise settings_error(id, settings, error) from error
     reading, actions = read(spec.gymnasium_observation_space, spec.gymnasium_action_space, masked=False)
     limit = spec.config.max_episode_steps
     worlds = PooledWorlds(partial(_pool, id, num_envs, dict(settings)), reading, num_envs)

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import torch
 
-from hdrqn_torchrl.envs.gym.arguments import SomeSubgoals, import_package_of
+from hdrqn_torchrl.envs.gym.arguments import SomeSubgoals, import_package_of, make_world
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
 from hdrqn_torchrl.envs.gym.making import make_gym
 from hdrqn_torchrl.envs.gym.minigrid.bot import bot_can_play, play
@@ -30,6 +30,7 @@ _VERBS = (
 )  # fmt: skip
 WORDS = tuple(sorted(set(_VERBS)))
 """Words of missions; all others have the same code."""
+_TASK = "a MiniGrid or BabyAI task"
 _USE_DONE = ("GoToDoor", "GoToObject")  # tasks whose end an agent has to declare
 
 
@@ -114,18 +115,10 @@ def _look(id: str, options: Mapping[str, Any]) -> tuple[Survey, bool]:
 
 @cache  # the episodes that it looks at are always the same
 def _looked(id: str, stated: tuple[tuple[str, Any], ...]) -> tuple[Survey, bool]:
-    options = dict(stated)
-    try:
-        env = gymnasium.make(id, **options)
-    except gymnasium.error.Error as error:
-        raise ValueError(f"id must be that of a MiniGrid or BabyAI task, got {id!r} ({error}).") from error
-    except TypeError as error:
-        raise ValueError(f"settings must be arguments that {id} takes, got {sorted(options)} ({error}).") from error
+    env = make_world(id, dict(stated), what=_TASK)
     try:
         if not hasattr(env.unwrapped, "grid"):
-            raise ValueError(
-                f"id must be that of a MiniGrid or BabyAI task, got {id!r}; use make_gym (env=gym) for others."
-            )
+            raise ValueError(f"id must be that of {_TASK}, got {id!r}; use make_gym (env=gym) for others.")
         return survey(env), bot_can_play(env, id)
     finally:
         env.close()
