@@ -20,6 +20,7 @@ class Arguments:
         frames: environment steps of the training, all worlds together.
         seconds: wall time after which a training stops, evaluations included; the same command goes on with more.
         bonus: added to the reward for each subgoal attained.
+        max_steps: length of an episode; 0: the task's own.
         interval_frames: steps between two evaluations.
         episodes: of an evaluation.
         final_episodes: of the last one.
@@ -32,6 +33,7 @@ class Arguments:
     frames: int = 300_000
     seconds: float = inf
     bonus: float = 0.0
+    max_steps: int = 0
     interval_frames: int = 50_000
     episodes: int = 100
     final_episodes: int = 500
@@ -55,6 +57,11 @@ class Arguments:
             sys.exit(f"error: {' and '.join(missing)} must be given: id=MiniGrid-DoorKey-8x8-v0.")
         return cls(**values)
 
+    @property
+    def task(self) -> str:
+        """The id, and what else tells the task from others."""
+        return f"{self.id}-max_steps{self.max_steps}" if self.max_steps else self.id
+
     def name_of(self, agent: str) -> str:
         """What tells a run of an agent from all others."""
-        return f"{self.id}-{agent}-bonus{self.bonus:g}-seed{self.seed}"
+        return f"{self.task}-{agent}-bonus{self.bonus:g}-seed{self.seed}"

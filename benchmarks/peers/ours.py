@@ -46,10 +46,6 @@ class OurArguments(Arguments):
         return self.runs / self.name_of(self.agent)
 
 
-FLAT = ["algo.sub_exploration._target_=hdrqn_torchrl.modules.RepeatingEpsilonGreedy"]
-"""The same epsilons and repeated actions; an agent without subgoals has no success of theirs to explore less by."""
-
-
 def settings_of(arguments: OurArguments) -> list[str]:
     """What ``train.py`` is told; it goes on with a run that lies in the folder already."""
     return [
@@ -58,7 +54,7 @@ def settings_of(arguments: OurArguments) -> list[str]:
         "algo=v3",
         f"algo.levels={arguments.levels}",
         f"algo.bonus_reward={arguments.bonus}",
-        *(FLAT if arguments.levels == 1 else []),
+        *([f"env.max_steps={arguments.max_steps}"] if arguments.max_steps else []),
         f"seed={arguments.seed}",
         f"total_frames={arguments.frames}",
         "device=cpu",
@@ -133,7 +129,7 @@ def _figures(row: dict[str, str]) -> dict[str, Any]:
 def _evaluation(arguments: OurArguments, figures: dict[str, Any]) -> Evaluation:
     return Evaluation(
         agent=arguments.agent,
-        id=arguments.id,
+        id=arguments.task,
         bonus=arguments.bonus,
         seed=arguments.seed,
         frames=int(float(figures["frames"])),

@@ -17,7 +17,7 @@ from arguments import Arguments
 from evaluations import Evaluation, append, read, write
 from sb3_contrib import RecurrentPPO
 from torchrl import torchrl_logger
-from torchrl.envs import InitTracker, TransformedEnv
+from torchrl.envs import EnvBase, InitTracker, TransformedEnv
 from worlds import PeerVecEnv, Player
 
 from hdrqn_torchrl.envs import make_minigrid
@@ -55,11 +55,11 @@ class Run:
         self.arguments = arguments
         name = arguments.name_of(AGENT)
         self.results, self.checkpoint = arguments.results / f"{name}.jsonl", arguments.runs / f"{name}.zip"
-        self.worlds = PeerVecEnv(make_minigrid(arguments.id, NUM_ENVS), bonus=arguments.bonus)
+        self.worlds = PeerVecEnv(self._make(NUM_ENVS), bonus=arguments.bonus)
         self.model = self._begin()
         known = [each for each in read(self.results) if each.frames <= self.model.num_timesteps]
         write(self.results, known if self.model.num_timesteps else [])
-        env = make_minigrid(arguments.id, min(EVALUATION_ENVS, arguments.episodes), seed=EVALUATION_SEED)
+        env = self._make(min(EVALUATION_ENVS, arguments.episodes), seed=EVALUATION_SEED)
         self.evaluation_env = TransformedEnv(env, InitTracker())
         self._start_clock(known[-1] if self.model.num_timesteps else None)
 
@@ -75,6 +75,9 @@ class Run:
         later = np.random.SeedSequence([self.arguments.seed, model.num_timesteps]).generate_state(1)[0]
         model.set_random_seed(int(later) >> 1)  # not the first episodes again
         return model
+
+    def _make(self, num_envs: int, seed: int | None = None) -> EnvBase:
+        return make_minigrid(self.arguments.id, num_envs, max_steps=self.arguments.max_steps or None, seed=seed)
 
     @property
     def seconds(self) -> float:
@@ -117,7 +120,7 @@ class Run:
         seconds, cpu_seconds = self.seconds, self.cpu_seconds  # until here
         told = Evaluation(
             agent=AGENT,
-            id=arguments.id,
+            id=arguments.task,
             bonus=arguments.bonus,
             seed=arguments.seed,
             frames=self.model.num_timesteps,

@@ -22,6 +22,7 @@ from hdrqn_torchrl.modules.features import (
 )
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.q_network import QNetwork
+from hdrqn_torchrl.modules.scaled_vector import ScaledVector
 from hdrqn_torchrl.modules.sizes import check_size, check_widths
 
 _COARSE = 14  # side of predicted images in pixels
@@ -161,7 +162,7 @@ def _features(spec: TensorSpec, widths: tuple[int, ...], *, channels: tuple[int,
         return CodeFeatures(code_sizes(spec, shape), widths, num_dims=len(shape))
     if kind == "image":
         return ConvFeatures(shape[0], _sides(shape), widths[-1], channels)
-    return FullyConnectedFeatures(shape[-1], widths)
+    return ChainedFeatures(ScaledVector(spec), FullyConnectedFeatures(shape[-1], widths))
 
 
 def observation_predictor(
@@ -188,7 +189,7 @@ def observation_predictor(
         if kind == "image":
             height, width = _sides(shape)
             return ImageDecoder(in_features, shape[0], (min(height, _COARSE), min(width, _COARSE)))
-        return VectorDecoder(in_features, shape[-1])
+        return VectorDecoder(in_features, shape[-1], ScaledVector(spec))
 
     return ObservationPredictor(
         decoder, hidden_size=hidden_size, num_actions=num_actions, max_steps=max_steps, width=width

@@ -126,20 +126,22 @@ class VectorDecoder(Decoder):
     Args:
         in_features: D.
         size: number of the vector's entries.
+        scaling: applied to the vector first; ``None``: nothing is.
 
     Examples:
         >>> VectorDecoder(8, size=4).error(torch.zeros(2, 3, 8), torch.zeros(2, 3, 4)).shape
         torch.Size([2, 3])
     """
 
-    def __init__(self, in_features: int, size: int) -> None:
+    def __init__(self, in_features: int, size: int, scaling: nn.Module | None = None) -> None:
         super().__init__()
         check_size("in_features", in_features, 128)
         check_size("size", size, "the number of the vector's entries")
+        self.scaling = scaling or nn.Identity()
         self.entries = nn.Linear(in_features, size)
 
     def error(self, vector: Tensor, observation: Tensor) -> Tensor:
-        return (self.entries(vector).float() - symlog(observation.float())).square().mean(-1)
+        return (self.entries(vector).float() - symlog(self.scaling(observation.float()))).square().mean(-1)
 
 
 def symlog(value: Tensor) -> Tensor:

@@ -33,6 +33,11 @@ class TestArguments:
         assert (found.frames, found.bonus, found.levels, found.seconds, str(found.runs)) == (2000, 0.5, 2, inf, "a/b")
         assert found.name_of("x") == f"{TASK}-x-bonus0.5-seed0"
 
+    def test_a_shorter_time_limit_is_another_task(self):
+        found = OurArguments(id=TASK, max_steps=200)
+        assert found.name_of("x") == f"{TASK}-max_steps200-x-bonus0-seed0"
+        assert "env.max_steps=200" in ours.settings_of(found)
+
     @pytest.mark.parametrize(
         ("words", "sentence"),
         [
