@@ -84,7 +84,10 @@ def train(run: Plan) -> float:
         with noting_errors(run, unless=refused):
             trainer, evaluation_env, players = begin(run)
         with noting_errors(run):
-            trainer.train()
+            try:
+                trainer.train()
+            finally:
+                trainer.collector.shutdown()
             return write_summary(run, trainer, evaluation_env, players)["return_mean"]
 
 
@@ -94,6 +97,7 @@ def in_words(run: Plan) -> Iterator[None]:
     from torchrl.checkpoint import CheckpointError
 
     from hdrqn_torchrl.learning.finite import NonFiniteError
+    from hdrqn_torchrl.runs.workers import WorkerError, WorkerLost
 
     try:
         yield
@@ -101,7 +105,7 @@ def in_words(run: Plan) -> Iterator[None]:
         raise
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    except (CheckpointError, NonFiniteError) as error:
+    except (CheckpointError, NonFiniteError, WorkerError, WorkerLost) as error:
         raise RunError(str(error)) from error
     except OSError as error:
         remedy = (
@@ -206,7 +210,7 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.envs.specs import interface_differences
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
-    from hdrqn_torchrl.runs.collectors import ResumableCollector
+    from hdrqn_torchrl.runs.collecting import make_collector
     from hdrqn_torchrl.runs.evaluation import evaluate
     from hdrqn_torchrl.runs.logging import RunLogger
     from hdrqn_torchrl.runs.references import Players
@@ -233,14 +237,13 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     players = Players(
         task_of(evaluation_base), play=chosen.ceilings, seconds=chosen.ceiling_seconds, tell=tell_of_player
     )
-    frames_per_batch = env.batch_size[0] * config.steps_per_batch
-    collector = ResumableCollector(
-        algorithm.transform(env),
-        algorithm.policy,
-        frames_per_batch=frames_per_batch,
-        total_frames=-(-config.total_frames // frames_per_batch) * frames_per_batch,
+    collector = make_collector(
+        config,
+        env,
+        algorithm,
         device=device,
-        auto_register_policy_transforms=False,
+        updates=lambda: sum(learner.updates for learner in algorithm.learners.values()),
+        allowed=allowed,
     )
     trainer = Trainer(
         algorithm,

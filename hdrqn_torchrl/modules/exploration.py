@@ -30,7 +30,7 @@ class EpsilonGreedy(nn.Module):
         end: epsilon from ``anneal_frames`` on.
         anneal_frames: length of the schedule in environment frames.
         ladder: spread of epsilon over the environments, epsilon to the power of 1 to 1 + ladder; 0: all have the same.
-            A single environment has the first rung; of several worker processes each has all of them.
+            A single environment has the first rung.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -84,6 +84,9 @@ class EpsilonGreedy(nn.Module):
         """Whether the schedule stands still."""
         self.fixed: float | None = None
         """One epsilon for all environments and subgoals in place of all others; for evaluations."""
+        self.rungs: tuple[int, int] | None = None
+        """The ladder's rung of the first environment, and their number, where these are only some of all; ``None``:
+        they are all."""
 
     def step(self, frames: int) -> None:
         """Advances the schedule by ``frames`` environment frames, unless it is held."""
@@ -160,8 +163,9 @@ class EpsilonGreedy(nn.Module):
         """
         if not self.ladder or not like.ndim:
             return self.epsilon
-        rung = torch.linspace(0.0, 1.0, len(like), device=like.device).view(-1, *[1] * (like.ndim - 1))
-        return self.epsilon ** (1.0 + self.ladder * rung)
+        first, number = self.rungs or (0, len(like))
+        rung = torch.linspace(0.0, 1.0, number, device=like.device)[first : first + len(like)]
+        return self.epsilon ** (1.0 + self.ladder * rung.view(-1, *[1] * (like.ndim - 1)))
 
 
 def choose(

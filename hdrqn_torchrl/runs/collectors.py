@@ -56,8 +56,11 @@ class ResumableCollector(Collector):
         """Restores what :meth:`state_dict` returned.
 
         Raises:
-            ValueError: if the step that was about to be taken has other entries than this environment.
+            ValueError: if the step that was about to be taken has other entries than this environment, or it is the
+                state of workers.
         """
+        if "workers" in state_dict:
+            raise ValueError(f"collector must be one with {len(state_dict['workers'])} workers, as before, got local.")
         super().load_state_dict(state_dict, strict=False)
         self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL numbered the episodes anew
         self._base_env.load_state_dict(state_dict["base_env"])

@@ -13,6 +13,8 @@ BOOKKEEPING = (
     "allowed_targets",
     "evaluation.ceilings",
     "evaluation.ceiling_seconds",
+    "collector.address",
+    "collector.patience_seconds",
 )
 """May differ when a run goes on."""
 NOT_LEARNED_FROM = (*BOOKKEEPING, "logger", "device", "threads", "log_frames")

@@ -128,9 +128,19 @@ class EpisodeTracker:
 
     def finished(self, batch: TensorDictBase) -> TensorDictBase:
         """Takes a collected batch ``[N, T]``; returns the episodes ``[M]`` that ended in it."""
+        self._forget(batch.get(keys.IS_INIT, None))
         after = batch.get("next").transpose(0, 1)  # [T, N]
         sums: TensorDictBase = torch.stack([self.add(step) for step in after.unbind(0)], 0)  # type: ignore[assignment]
         return sums[after.get(keys.DONE).squeeze(-1)]
+
+    def _forget(self, init: Tensor | None) -> None:
+        """Clears the sums of episodes that were lost between two batches: others begin in their rows ``[N, T, 1]``."""
+        if init is None or self.sums is None:
+            return
+        begins = init[:, 0].squeeze(-1)
+        self.sums = self.sums.masked_fill(begins, 0.0)
+        if self._in_order is not None:
+            self._in_order = self._in_order.masked_fill(begins, 0)
 
     def state_dict(self) -> dict[str, Any]:
         """Sums of the episodes in progress."""

@@ -40,6 +40,21 @@ class CheckpointSettings:
 
 
 @dataclass(kw_only=True)
+class CollectorSettings:
+    """Who collects."""
+
+    kind: str = "local"
+    """This process; or workers: ``"processes"`` of this machine, or ``"ray"``."""
+    workers: int = 1
+    sync: bool = True
+    """Whether workers wait for new weights; ``False``: theirs are one batch old."""
+    address: str | None = None
+    """Of a running Ray cluster; ``None``: one is started on this machine."""
+    patience_seconds: float = 300.0
+    """After which a worker that does not answer is replaced."""
+
+
+@dataclass(kw_only=True)
 class RunSettings:
     """All settings of a run; a key that is not here is refused. Defaults are for runs older than the setting."""
 
@@ -56,6 +71,7 @@ class RunSettings:
     log_frames: int
     evaluation: EvaluationSettings
     checkpoint: CheckpointSettings
+    collector: CollectorSettings = field(default_factory=CollectorSettings)
     output_root: str
     init_from: str | None = None
     init_checkpoint: str = "best"
@@ -64,7 +80,12 @@ class RunSettings:
     allowed_targets: list[str] = field(default_factory=list)
 
 
-SECTIONS: dict[str, type] = {"evaluation": EvaluationSettings, "checkpoint": CheckpointSettings}
+SECTIONS: dict[str, type] = {
+    "evaluation": EvaluationSettings,
+    "checkpoint": CheckpointSettings,
+    "collector": CollectorSettings,
+}
+_COLLECTORS = ("local", "processes", "ray")
 _LIMITS = (
     ("total_frames", 1, 10**15),
     ("threads", 1, 1_024),
@@ -77,6 +98,7 @@ _LIMITS = (
     ("evaluation.final_episodes", 1, 10**9),
     ("evaluation.seed", 0, 2**62),
     ("checkpoint.interval_frames", 1, 10**15),
+    ("collector.workers", 1, 10_000),
     ("checkpoint.keep_last", 2, 1_000),  # so that there is one while the newest is being replaced
 )
 
@@ -141,8 +163,27 @@ def check(settings: RunSettings) -> None:
     minutes = settings.checkpoint.interval_minutes
     if minutes <= 0:
         raise SettingsError(f"checkpoint.interval_minutes must be > 0, got {minutes}; use 10.")
+    _check_collector(settings.collector)
     _check_choices(settings)
     check_targets(as_plain(settings), settings.allowed_targets)
+
+
+def _check_collector(collector: CollectorSettings) -> None:
+    kind = collector.kind
+    if kind not in _COLLECTORS:
+        raise SettingsError(f"collector.kind must be one of {', '.join(_COLLECTORS)}, got {kind!r}; use collector=ray.")
+    if kind == "local" and (collector.workers != 1 or not collector.sync):
+        got = f"workers={collector.workers}, sync={shown(collector.sync)}"
+        raise SettingsError(
+            f"collector.workers and collector.sync must be 1 and true for collector=local, got {got}; use "
+            "collector=processes or collector=ray."
+        )
+    if collector.address is not None and kind != "ray":
+        raise SettingsError(
+            f"collector.address must be null for collector={kind}, got {collector.address!r}; use collector=ray."
+        )
+    if collector.patience_seconds <= 0:
+        raise SettingsError(f"collector.patience_seconds must be > 0, got {collector.patience_seconds}; use 300.")
 
 
 def _check_choices(settings: RunSettings) -> None:

@@ -26,6 +26,7 @@ from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.state_checks import rules_of
 from hdrqn_torchrl.runs.window import Window, check_counters
+from hdrqn_torchrl.runs.workers import WorkersCollector
 
 
 class Trainer:
@@ -37,7 +38,8 @@ class Trainer:
     Args:
         algorithm: policy and learners.
         collector: yields batches ``[N, T]`` from the transformed environment. If ``checkpoints`` are given it must
-            keep its state (:class:`~hdrqn_torchrl.runs.collectors.ResumableCollector`).
+            keep its state (:class:`~hdrqn_torchrl.runs.collectors.ResumableCollector`,
+            :class:`~hdrqn_torchrl.runs.workers.WorkersCollector`).
         logger: where log points go.
         evaluate: plays greedy episodes and returns their averages (:func:`~hdrqn_torchrl.runs.evaluation.evaluate`).
         total_frames: environment frames to collect.
@@ -53,7 +55,7 @@ class Trainer:
     def __init__(
         self,
         algorithm: Algorithm,
-        collector: BaseCollector,
+        collector: BaseCollector | WorkersCollector,
         *,
         logger: RunLogger,
         evaluate: Callable[[], dict[str, float]],
@@ -169,6 +171,8 @@ class Trainer:
         }
         for monitor in self.algorithm.monitors.values():
             row |= monitor.metrics()
+        if isinstance(self.collector, WorkersCollector):
+            row |= self.collector.metrics()
         best = False
         if evaluation:
             with self._stop.at_once():
@@ -189,6 +193,8 @@ class Trainer:
         self._window = Window(self.frames)
         for monitor in self.algorithm.monitors.values():
             monitor.clear()
+        if isinstance(self.collector, WorkersCollector):
+            self.collector.clear()
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint of the whole training, unless nothing happened since the last one.

@@ -1,0 +1,102 @@
+"""Workers in processes of this machine, behind pipes: nothing listens anywhere."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import traceback
+from collections.abc import Mapping
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any
+
+from torch import Tensor
+
+from hdrqn_torchrl.runs.workers.handles import WorkerError, WorkerLost
+from hdrqn_torchrl.runs.workers.worker import Worker
+
+
+class ProcessWorkers:
+    """Starts workers in processes of this machine.
+
+    Args:
+        make: makes a worker when it is called with its number and seed: ``partial(Worker, make, steps=8)``.
+    """
+
+    def __init__(self, make: partial[Worker]) -> None:
+        self.make = make
+
+    def start(self, index: int, *, seed: int) -> ProcessWorker:
+        """See :class:`WorkerPlace`."""
+        return ProcessWorker(partial(self.make, index, seed=seed))
+
+    def share(self, weights: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+        """The weights; a pipe copies them."""
+        return weights
+
+    def close(self) -> None:
+        """Nothing is left when the workers have ended."""
+
+
+class ProcessWorker:
+    """A worker in a process, which ends with this one, however this one ends: its pipe is then closed."""
+
+    def __init__(self, make: partial[Worker]) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(theirs, make), daemon=True)
+        self.process.start()
+        theirs.close()
+
+    def send(self, method: str, *args: Any) -> None:
+        """See :class:`WorkerHandle`."""
+        try:
+            self._pipe.send((method, args))
+        except OSError as error:
+            raise WorkerLost(self._how()) from error
+
+    def receive(self, seconds: float) -> Any:
+        """See :class:`WorkerHandle`."""
+        try:
+            if not self._pipe.poll(seconds):
+                raise WorkerLost(f"did not answer for {seconds:g} seconds")
+            went_well, result = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise WorkerLost(self._how()) from error
+        if not went_well:
+            raise WorkerError(result)
+        return result
+
+    def stop(self) -> None:
+        """See :class:`WorkerHandle`."""
+        self._pipe.close()
+        self.process.kill()
+        self.process.join()
+        self.process.close()
+
+    def _how(self) -> str:
+        self.process.join(1.0)
+        code = self.process.exitcode
+        return f"ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
+
+
+def _serve(pipe: Connection, make: partial[Worker]) -> None:
+    """Answers until the other side is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the learner decides when a worker ends
+    os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+    worker: Worker | None = None
+    while True:
+        try:
+            method, args = pipe.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            worker = make() if worker is None else worker
+            answer = (True, getattr(worker, method)(*args))
+        except Exception:  # whatever it is, the learner tells it
+            answer = (False, traceback.format_exc())
+        try:
+            pipe.send(answer)
+        except OSError:
+            return

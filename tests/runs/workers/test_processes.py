@@ -1,0 +1,77 @@
+"""Workers in processes: real ones, killed, failing and hanging."""
+
+from __future__ import annotations
+
+import os
+import time
+from functools import partial
+
+import pytest
+import torch
+from stamped_worlds import (
+    AGENTS,
+    StampedWorlds,
+    make_dying_part,
+    make_failing_part,
+    make_part,
+    make_slow_part,
+)
+
+from hdrqn_torchrl.runs.workers import ProcessWorkers, Worker, WorkerError, WorkerLost, WorkersCollector
+
+WORLDS = 4
+
+
+def collector_of(make, *, workers=2, **arguments):
+    torch.manual_seed(0)
+    env = StampedWorlds(WORLDS, seed=0)
+    algorithm = AGENTS["v3"](env)
+    place = ProcessWorkers(partial(Worker, make, steps=8, all_worlds=WORLDS, threads=1))
+    return WorkersCollector(
+        place, algorithm.transform(env), algorithm.policy, workers=workers, frames_per_batch=WORLDS * 8,
+        **{"total_frames": 10**9, "sync": False, **arguments},
+    )  # fmt: skip
+
+
+def test_a_killed_worker_is_replaced_and_none_is_left_behind(capsys):
+    collector = collector_of(partial(make_part, "v3", WORLDS // 2))
+    batches = iter(collector)
+    before = next(batches).clone()
+    collector._workers[1].process.kill()
+    later = [next(batches).clone() for _ in range(3)]
+    assert collector.metrics()["collector/lost_workers"] == 1
+    assert "worker 1 ended by SIGKILL; it is replaced, and new episodes begin" in capsys.readouterr().err
+    whole = torch.cat([before, *later], 1)
+    assert (whole["observation"][:2, 1:, 0] == whole["observation"][:2, :-1, 0]).all()  # worker 0: the same world
+    seeds = whole["observation"][2:, :, 0]
+    assert len(seeds.unique()) == 2 and len(seeds.unique_consecutive(dim=1)[0]) == 2
+    pids = [worker.process.pid for worker in collector._workers]
+    collector.shutdown()
+    for pid in pids:
+        with pytest.raises(OSError):
+            os.kill(pid, 0)
+
+
+def test_an_error_in_a_worker_ends_the_collection_and_is_told():
+    collector = collector_of(make_failing_part, workers=1)
+    with pytest.raises(WorkerError, match="RuntimeError: no such world"):
+        next(iter(collector))
+    collector.shutdown()
+
+
+@pytest.mark.slow
+def test_a_worker_that_ends_again_and_again_ends_the_collection():
+    collector = collector_of(make_dying_part, workers=1)
+    with pytest.raises(WorkerLost, match="worker 0 ended by SIGKILL, 3 times in a row"):
+        next(iter(collector))
+    collector.shutdown()
+
+
+@pytest.mark.slow
+def test_a_worker_that_hangs_is_replaced(tmp_path):
+    collector = collector_of(partial(make_slow_part, tmp_path), workers=2, patience_seconds=45.0)
+    started = time.monotonic()
+    assert next(iter(collector)).shape == (WORLDS, 8)
+    assert collector.metrics()["collector/lost_workers"] == 2
+    assert time.monotonic() - started < 300
+    collector.shutdown()

@@ -1,0 +1,52 @@
+"""Workers in this process, to be lost at will."""
+
+from __future__ import annotations
+
+import torch
+
+from hdrqn_torchrl.runs.workers import Worker, WorkerLost
+
+
+class HereWorkers:
+    """A place whose workers answer when they are asked, with random numbers of their own."""
+
+    def __init__(self, make):
+        self.make, self.started, self.closed = make, [], 0
+        self.loses = []  # numbers of those that are lost at their next answer
+
+    def start(self, index, *, seed):
+        self.started.append((index, seed))
+        return HereWorker(self, index, seed)
+
+    def share(self, weights):
+        return {name: value.clone() for name, value in weights.items()}
+
+    def close(self):
+        self.closed += 1
+
+
+class HereWorker:
+    def __init__(self, place, index, seed):
+        self.place, self.index, self.stopped = place, index, False
+        with torch.random.fork_rng():
+            self.worker = Worker(place.make, index, seed=seed, steps=8)
+            self.stream = torch.get_rng_state()
+
+    def send(self, method, *args):
+        self.call = method, args
+
+    def receive(self, seconds):
+        if self.index in self.place.loses:
+            self.place.loses.remove(self.index)
+            raise WorkerLost("was lost")
+        method, args = self.call
+        if method == "collect" and len(args) > 1 and args[1] is not None:
+            return self.worker.collect(*args)
+        with torch.random.fork_rng():
+            torch.set_rng_state(self.stream)
+            answer = getattr(self.worker, method)(*args)
+            self.stream = torch.get_rng_state()
+        return answer
+
+    def stop(self):
+        self.stopped = True
