@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -11,6 +12,13 @@ from torch import Tensor
 
 from hdrqn_torchrl.runs.workers.handles import WorkerError, WorkerLost
 from hdrqn_torchrl.runs.workers.worker import Worker
+
+_LOOPBACK, _OWN_NODE = "127.0.0.1", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+_OWN_CLUSTER = {
+    _OWN_NODE: "0",  # else Ray takes another address of this machine instead of the loopback one
+    "RAY_AUTH_MODE": "disabled",  # else it writes a token to the home folder
+    "RAY_USAGE_STATS_ENABLED": "0",
+}
 
 
 class RayWorkers:
@@ -25,19 +33,16 @@ class RayWorkers:
     Raises:
         ImportError: if Ray is missing.
         ConnectionError: if there is no cluster at the address.
+        RuntimeError: if a cluster started here would listen on other addresses than 127.0.0.1.
     """
 
     def __init__(self, make: partial[Worker], *, workers: int, address: str | None = None) -> None:
         ray = _ray()
         self._began = not ray.is_initialized()
-        if self._began:
-            if address is None:
-                os.environ.setdefault("RAY_AUTH_MODE", "disabled")  # else a token is written to the home folder
-                os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-                where: dict[str, Any] = {"_node_ip_address": "127.0.0.1", "num_cpus": workers}
-            else:
-                where = {"address": address}
-            ray.init(include_dashboard=False, configure_logging=False, log_to_driver=False, **where)
+        if self._began and address is None:
+            _start_on_loopback(ray, workers)
+        elif self._began:
+            ray.init(address=address, configure_logging=False, log_to_driver=False)
         self._actor = ray.remote(num_cpus=1, max_restarts=0)(Worker)
         self.make = make
 
@@ -53,6 +58,34 @@ class RayWorkers:
         """Ends the cluster, or the connection to it, if it began here."""
         if self._began and _ray().is_initialized():
             _ray().shutdown()
+
+
+def _start_on_loopback(ray: Any, workers: int) -> None:
+    """A cluster of this machine that nobody else can reach.
+
+    ``ray.init`` would replace 127.0.0.1 by another address of this machine, unless a variable of the environment was
+    set when Ray was imported; TorchRL imports it before anyone can set it.
+    """
+    from ray._private import ray_constants
+
+    before, ray_constants.ENABLE_RAY_CLUSTER = ray_constants.ENABLE_RAY_CLUSTER, False
+    environment = dict(os.environ)
+    os.environ.update(_OWN_CLUSTER, PYTHONPATH=os.pathsep.join(sys.path))  # workers find what this process finds
+    try:
+        ray.init(
+            _node_ip_address=_LOOPBACK, num_cpus=workers, include_dashboard=False, configure_logging=False,
+            log_to_driver=False,
+        )  # fmt: skip
+    finally:
+        ray_constants.ENABLE_RAY_CLUSTER = before
+        os.environ.clear()
+        os.environ.update(environment)
+    if (found := {node["NodeManagerAddress"] for node in ray.nodes()}) != {_LOOPBACK}:
+        ray.shutdown()
+        raise RuntimeError(
+            f"Ray must listen on {_LOOPBACK} only, got {sorted(found)} with Ray {ray.__version__}; set {_OWN_NODE}=0 "
+            "before Python starts, or start a cluster and give collector.address."
+        )
 
 
 class RayWorker:
