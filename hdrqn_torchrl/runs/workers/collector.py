@@ -212,6 +212,7 @@ class WorkersCollector:
             "next_ids": list(self._next_ids),
             "lost_workers": self.lost_workers,
             "lost_episodes": self.lost_episodes,
+            "ages": list(self._ages),
             "workers": self._ask_all("state_dict", [()] * len(self._workers)),
         }
 
@@ -231,6 +232,7 @@ class WorkersCollector:
         self._starts, self._first_ids = list(state["starts"]), list(state["first_ids"])
         self._next_ids = list(state["next_ids"])
         self.lost_workers, self.lost_episodes = state["lost_workers"], state["lost_episodes"]
+        self._ages = list(state["ages"])
 
     def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
         for index, args in enumerate(arguments):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
 import traceback
 from collections.abc import Mapping
@@ -52,7 +53,7 @@ class ProcessWorker:
     def send(self, method: str, *args: Any) -> None:
         """See :class:`WorkerHandle`."""
         try:
-            self._pipe.send((method, args))
+            _put(self._pipe, (method, args))
         except OSError as error:
             raise WorkerLost(self._how()) from error
 
@@ -61,7 +62,7 @@ class ProcessWorker:
         try:
             if not self._pipe.poll(seconds):
                 raise WorkerLost(f"did not answer for {seconds:g} seconds")
-            went_well, result = self._pipe.recv()
+            went_well, result = _get(self._pipe)
         except (EOFError, OSError) as error:
             raise WorkerLost(self._how()) from error
         if not went_well:
@@ -81,6 +82,15 @@ class ProcessWorker:
         return f"ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
 
 
+def _put(pipe: Connection, message: Any) -> None:
+    """Sends a copy. ``Connection.send`` would share the memory of tensors, which the learner changes in place."""
+    pipe.send_bytes(pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL))
+
+
+def _get(pipe: Connection) -> Any:
+    return pickle.loads(pipe.recv_bytes())
+
+
 def _serve(pipe: Connection, make: partial[Worker]) -> None:
     """Answers until the other side is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the learner decides when a worker ends
@@ -88,7 +98,7 @@ def _serve(pipe: Connection, make: partial[Worker]) -> None:
     worker: Worker | None = None
     while True:
         try:
-            method, args = pipe.recv()
+            method, args = _get(pipe)
         except (EOFError, OSError):
             return
         try:
@@ -97,6 +107,6 @@ def _serve(pipe: Connection, make: partial[Worker]) -> None:
         except Exception:  # whatever it is, the learner tells it
             answer = (False, traceback.format_exc())
         try:
-            pipe.send(answer)
+            _put(pipe, answer)
         except OSError:
             return

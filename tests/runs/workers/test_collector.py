@@ -168,10 +168,11 @@ def test_it_goes_on_where_its_state_was_taken(sync):
     algorithm, collector = stamped("v3", 2, sync=sync)
     learned(algorithm, collector, 4)
     state, weights = collector.state_dict(), {k: v.clone() for k, v in algorithm.policy.state_dict().items()}
-    expected = rounds(collector, 3)
+    before, expected = collector.metrics(), rounds(collector, 3)
     other, again = stamped("v3", 2, sync=sync)
     other.policy.load_state_dict(weights)
     again.load_state_dict(state)
+    assert again.metrics() == before
     for one, two in zip(rounds(again, 3), expected, strict=True):
         assert (one["observation"] == two["observation"]).all()
         assert (one["action"] == two["action"]).all()

@@ -52,6 +52,14 @@ def test_a_killed_worker_is_replaced_and_none_is_left_behind(capsys):
             os.kill(pid, 0)
 
 
+def test_what_is_sent_is_a_copy():
+    collector = collector_of(partial(make_part, "v3", WORLDS), workers=1)
+    batch = next(iter(collector))
+    assert not any(parameter.is_shared() for parameter in collector.policy.parameters())
+    assert not batch["observation"].is_shared()
+    collector.shutdown()
+
+
 def test_an_error_in_a_worker_ends_the_collection_and_is_told():
     collector = collector_of(make_failing_part, workers=1)
     with pytest.raises(WorkerError, match="RuntimeError: no such world"):
