@@ -20,14 +20,16 @@ class FiniteGuard:
 
     On a CPU it looks at once. On a GPU the host would have to wait for every update; there the optimiser itself skips
     the step and all that follow (``found_inf`` of fused Adam, which never leaves the device), the first fault is kept
-    on the device, and :meth:`check` reports it when called.
+    on the device, and :meth:`check` reports it when called. What is kept stays in the same memory, so that a captured
+    update goes on with it.
 
     Args:
         at_once: whether to look at every update.
 
     Examples:
         >>> guard, nan = FiniteGuard(at_once=False), torch.tensor(float("nan"))
-        >>> guard.watch(torch.tensor(2.0), {"weight": nan}, nan, "update 7")
+        >>> guard.begin("update 7")
+        >>> guard.watch(torch.tensor(2.0), {"weight": nan}, nan)
         tensor(1.)
         >>> guard.check()
         Traceback (most recent call last):
@@ -38,17 +40,27 @@ class FiniteGuard:
         self.at_once = at_once
         self._found: Tensor | None = None  # 1.0 from the first such update on
         self._first: Tensor | None = None  # its loss, its largest gradients, and its place in _places
+        self._count: Tensor | None = None  # updates since the last check
         self._names: list[str] = []
         self._places: list[str] = []
 
-    def watch(self, loss: Tensor, gradients: Mapping[str, Tensor], norm: Tensor, place: str) -> Tensor | None:
-        """Takes one update.
+    def begin(self, place: str) -> None:
+        """Takes note, on the host, of which update is next.
+
+        Args:
+            place: for the message.
+        """
+        if self.at_once:
+            self._places.clear()
+        self._places.append(place)
+
+    def watch(self, loss: Tensor, gradients: Mapping[str, Tensor], norm: Tensor) -> Tensor | None:
+        """Takes one update, after :meth:`begin`. If it does not look at once, nothing is read on the host.
 
         Args:
             loss: ``[]``.
             gradients: by the name of their parameter.
             norm: of all gradients together, ``[]``.
-            place: which update it is, for the message.
 
         Returns:
             What the optimiser needs to know, ``[]``: 1 if it must skip the step; ``None`` if it need not ask.
@@ -59,19 +71,20 @@ class FiniteGuard:
         loss = loss.detach()
         sound = torch.isfinite(loss + norm)
         if not self.at_once:
-            return self._remember(sound, loss, gradients, place)
+            return self._remember(sound, loss, gradients)
         if not sound:
-            raise NonFiniteError(self._explain(loss, _largest(gradients), list(gradients), place))
+            raise NonFiniteError(self._explain(loss, _largest(gradients), list(gradients), self._places[-1]))
         return None
 
-    def _remember(self, sound: Tensor, loss: Tensor, gradients: Mapping[str, Tensor], place: str) -> Tensor:
-        state = torch.stack([loss, *_largest(gradients), torch.full_like(loss, len(self._places))])
+    def _remember(self, sound: Tensor, loss: Tensor, gradients: Mapping[str, Tensor]) -> Tensor:
         self._names = list(gradients)
-        self._places.append(place)
-        if self._found is None or self._first is None:
-            self._found, self._first = torch.zeros_like(loss), state
-        self._first = torch.where(self._found > 0, self._first, state)
-        self._found = torch.maximum(self._found, (~sound).to(loss.dtype))
+        if self._found is None or self._first is None or self._count is None:
+            self._found, self._count = torch.zeros_like(loss), torch.zeros_like(loss)
+            self._first = loss.new_zeros(len(gradients) + 2)
+        state = torch.stack([loss, *_largest(gradients), self._count])
+        self._first.copy_(torch.where(self._found > 0, self._first, state))
+        self._found.copy_(torch.maximum(self._found, (~sound).to(loss.dtype)))
+        self._count += 1
         return self._found
 
     def check(self) -> None:
@@ -83,7 +96,9 @@ class FiniteGuard:
         if self._found is not None and self._first is not None and self._found > 0:
             loss, *largest, place = self._first.unbind()
             raise NonFiniteError(self._explain(loss, largest, self._names, self._places[int(place)]))
-        self._places = []
+        self._places.clear()
+        if self._count is not None:
+            self._count.zero_()
 
     @staticmethod
     def _explain(loss: Tensor, largest: Sequence[Tensor], names: Sequence[str], place: str) -> str:

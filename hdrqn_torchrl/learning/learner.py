@@ -7,20 +7,21 @@ import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 
 from hdrqn_torchrl.data import Continuity, sample_sequences
+from hdrqn_torchrl.learning.captured import Captured, wants_capture
 from hdrqn_torchrl.learning.finite import FiniteGuard
 from hdrqn_torchrl.learning.memory import Extract, make_longer_episodes, make_memory
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
-from hdrqn_torchrl.learning.precision import choose_precision, matrix_products
+from hdrqn_torchrl.learning.precision import choose_precision
 from hdrqn_torchrl.learning.settings import LearnerSettings
 from hdrqn_torchrl.learning.stored import check_counters, holds_inputs_twice
 from hdrqn_torchrl.learning.target_network import SoftTargetUpdate
+from hdrqn_torchrl.learning.update_step import UpdateStep
 
 
 class Learner:
@@ -71,7 +72,10 @@ class Learner:
         self.precision = choose_precision(settings.precision, network)
         self.guard = FiniteGuard(at_once=self.device.type == "cpu")
         self.updates, self.frames = 0, 0
-        self.optimizer = GroupedAdam(self._parameters, separate=separate or {}, learning_rate=self.learning_rate)
+        captures = wants_capture(settings.capture, self.device.type)
+        self.optimizer = GroupedAdam(
+            self._parameters, separate=separate or {}, learning_rate=self.learning_rate, capturable=captures
+        )
         self.buffer = make_memory(
             settings,
             loss,
@@ -80,6 +84,15 @@ class Learner:
             samples_per_draw=samples_per_draw,
             device=self.device,
         )
+        self._step = UpdateStep(
+            loss,
+            self._parameters,
+            optimizer=self.optimizer,
+            target_updater=self.target_updater,
+            guard=self.guard,
+            max_grad_norm=settings.max_grad_norm,
+        )
+        self._captured = Captured(lambda sample, ahead: self._step(sample, self.precision, ahead)) if captures else None
         self._sequence_len = (settings.slice_len or 0) + getattr(loss, "lookahead", 0)
         self._longer = make_longer_episodes(settings, loss, num_envs=num_envs, episode_len=episode_len)
         self._continuity = Continuity()
@@ -182,30 +195,16 @@ class Learner:
             NonFiniteError: if loss or gradient is; the weights are as they were. On a GPU they are left alone, too, and
                 :meth:`check_finite` raises it.
         """
-        with matrix_products(self.precision, self.device.type):
-            metrics = dict(self.loss(sample).items())
-        priority = metrics.pop("priority", None)
-        self.optimizer.zero_grad()
-        metrics["loss"].backward()
-        norm = self._watch_gradients(metrics["loss"])
-        if self.settings.max_grad_norm is not None:
-            self.optimizer.clip_gradients(self.settings.max_grad_norm, norm)
-            metrics["grad_norm"] = norm
-        self.optimizer.step()
-        self.target_updater.step()
+        self.guard.begin(f"update {self.updates + 1}, frame {self.frames}")
+        if self._captured is None:
+            report = self._step(sample, self.precision)
+        else:
+            report = self._captured(sample, self._step.draw_ahead(sample))
+        priority = report.pop("priority", None)
         self.updates += 1
         if self.settings.priority_exponent is not None:
             self.buffer.update_priority(sample["index"][:, 0], priority)
-        return {name: value.detach() for name, value in metrics.items()}
-
-    def _watch_gradients(self, loss: Tensor) -> Tensor:
-        """Norm of all gradients; an update in which something is not finite goes no further."""
-        gradients = {name: each.grad for name, each in self._parameters.items() if each.grad is not None}
-        norm = torch.nn.utils.get_total_norm(gradients.values())
-        skip = self.guard.watch(loss, gradients, norm, f"update {self.updates + 1}, frame {self.frames}")
-        if skip is not None:
-            self.optimizer.found_inf = skip  # type: ignore[attr-defined]  # read by torch's fused Adam
-        return norm
+        return report
 
     def copy_to_target(self) -> None:
         """Makes the target network the same as the one that is trained."""
@@ -268,6 +267,8 @@ class Learner:
         """
         check_counters(state, self.settings)
         self._continuity.reset()
+        if self._captured is not None:
+            self._captured.reset()
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_state_dict(state["loss"])
         self.extract.load_state_dict(state["extract"])

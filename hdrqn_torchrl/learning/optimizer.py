@@ -17,6 +17,7 @@ class GroupedAdam(torch.optim.Adam):
         parameters: by name.
         separate: prefixes of the names of such parts, and their shares of the learning rate.
         learning_rate: of all the rest.
+        capturable: whether steps can be captured: learning rates are then tensors next to the parameters.
 
     Raises:
         ValueError: if a part has no parameters, or a share is not positive.
@@ -29,17 +30,32 @@ class GroupedAdam(torch.optim.Adam):
     """
 
     def __init__(
-        self, parameters: Mapping[str, Parameter], *, separate: Mapping[str, float], learning_rate: float
+        self,
+        parameters: Mapping[str, Parameter],
+        *,
+        separate: Mapping[str, float],
+        learning_rate: float,
+        capturable: bool = False,
     ) -> None:
         groups = _group(parameters, separate)
         self.shares = [share for share, _ in groups]
-        super().__init__([{"params": members} for _, members in groups], lr=learning_rate, fused=True)
+        members = [{"params": members} for _, members in groups]
+        super().__init__(members, lr=learning_rate, fused=True, capturable=capturable)
+        self._rates = [torch.tensor(learning_rate, device=members[0].device) for _, members in groups]
+        self._capturable = capturable
         self.set_learning_rate(learning_rate)
 
     def set_learning_rate(self, rate: float) -> None:
         """Sets the rate of every part."""
-        for share, group in zip(self.shares, self.param_groups, strict=True):
-            group["lr"] = share * rate
+        for share, group, own in zip(self.shares, self.param_groups, self._rates, strict=True):
+            group["lr"] = own.fill_(share * rate) if self._capturable else share * rate
+
+    def state_dict(self) -> dict[str, Any]:
+        """What torch's Adam returns, with learning rates as numbers: the same, whether steps can be captured or not."""
+        state = super().state_dict()
+        for group in state["param_groups"]:
+            group.update(lr=float(group["lr"]), capturable=False)
+        return state
 
     def clip_gradients(self, largest: float, norm: Tensor) -> None:
         """Clips the gradients of each part to the norm ``largest``; ``norm`` is that of all parts together."""
@@ -61,6 +77,10 @@ class GroupedAdam(torch.optim.Adam):
                 "with the settings that it was saved with."
             )
         super().load_state_dict(state_dict)
+        for group in self.param_groups:
+            group["capturable"] = self._capturable
+        if self._capturable:
+            self.set_learning_rate(self.param_groups[0]["lr"])
         self._lay_out_like_parameters()
 
     def _has_same_options(self, stored: list[dict[str, Any]]) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling
+from hdrqn_torchrl.learning.captured import Capture
 from hdrqn_torchrl.learning.precision import Precision
 from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import check_returns, target_lookahead
@@ -54,6 +55,8 @@ class LearnerSettings:
         trace_decay: lambda of Q(lambda) with Watkins' cut, along the sequence; 0: one-step targets.
         n_step: number of rewards in a target; 1: one-step targets.
         precision: ``"fp32"``, ``"bf16"`` or ``"auto"`` (:func:`~hdrqn_torchrl.learning.precision.choose_precision`).
+        capture: whether updates are captured as graphs of the GPU; ``"auto"``: where there is one
+            (:func:`~hdrqn_torchrl.learning.captured.wants_capture`).
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -81,6 +84,7 @@ class LearnerSettings:
     trace_decay: float = 0.0
     n_step: int = 1
     precision: Precision | Literal["auto"] = "fp32"
+    capture: Capture = "auto"
 
     def __post_init__(self) -> None:
         check_returns(self.trace_decay, self.n_step)

@@ -67,7 +67,7 @@ class _RestartingLSTM(torch.autograd.Function):
         of_write, of_forget, of_update, of_read = grad_gates.chunk(4, -1)
         of_write *= update
         of_forget *= cells
-        torch.addcmul(write, write, update * update, value=-1, out=of_update)
+        of_update.copy_(write).addcmul_(write, update * update, value=-1)
         of_read *= squashed
         by_cell = grad_gates.unflatten(-1, (4, -1))[..., :3, :]
         output_by_cell = torch.addcmul(read, read, squashed * squashed, value=-1)

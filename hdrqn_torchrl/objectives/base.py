@@ -13,7 +13,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.utils import distance_loss
 
 from hdrqn_torchrl.modules import ObservationPredictor
-from hdrqn_torchrl.objectives.prediction import prediction_loss
+from hdrqn_torchrl.objectives.prediction import draw_ahead, prediction_loss
 from hdrqn_torchrl.objectives.sequences import step_of
 from hdrqn_torchrl.objectives.targets import double_q_value, importance_weight, training_mask
 
@@ -83,6 +83,8 @@ class SequenceLoss(LossModule):
         self.__dict__["_predictor"] = predictor  # its parameters are the network's
         self.burn_in, self.train_exact_states, self.lookahead = burn_in, train_exact_states, lookahead
         self.double, self.loss_function, self.prediction_weight = double, loss_function, prediction_weight
+        self.ahead: int | None = None
+        """How many steps ahead the predictor is trained; ``None``: it is drawn again at every call."""
         if self._predicts:
             self.out_keys = [*self.out_keys, "prediction_loss"]
 
@@ -92,6 +94,15 @@ class SequenceLoss(LossModule):
     @property
     def _predicts(self) -> bool:
         return self._predictor is not None and self.prediction_weight > 0.0
+
+    def draw_ahead(self, length: int) -> int | None:
+        """A number for :attr:`ahead`, as a call on sequences of ``length`` entries would draw it.
+
+        It is all that a call draws on the host, so that what follows from it can be captured.
+        """
+        if self._predictor is None or not self._predicts:
+            return None
+        return draw_ahead(self._predictor, length - min(self.lookahead, 1))
 
     def _valid(self, tensordict: TensorDictBase) -> Tensor:
         """Which steps are not padding, ``[B, T]`` bool."""
@@ -121,7 +132,7 @@ class SequenceLoss(LossModule):
     ) -> Tensor:
         """Mean error of what the memory expects to see; see :func:`~hdrqn_torchrl.objectives.prediction_loss`."""
         assert self._predictor is not None
-        return prediction_loss(self._predictor, memory, action, observation, valid=valid, cut=cut)
+        return prediction_loss(self._predictor, memory, action, observation, valid=valid, cut=cut, ahead=self.ahead)
 
 
 def masked_mean(value: Tensor, mask: Tensor) -> Tensor:

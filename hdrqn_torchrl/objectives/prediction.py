@@ -16,8 +16,9 @@ def prediction_loss(
     *,
     valid: Tensor,
     cut: Tensor,
+    ahead: int | None = None,
 ) -> Tensor:
-    """Mean error of the predictor some steps ahead; the number of steps is drawn at each call.
+    """Mean error of the predictor some steps ahead.
 
     Args:
         predictor: the predictor.
@@ -26,11 +27,20 @@ def prediction_loss(
         observation: ``[B, T + 1, ...]``.
         valid: ``[B, T + 1]`` bool, ``False`` for padding, which only follows valid steps.
         cut: ``[B, T]`` bool; the next observation does not result from the step (another episode begins).
+        ahead: number of steps; ``None``: :func:`draw_ahead`.
 
     Returns:
         Scalar; 0 if there was nothing to predict.
     """
-    ahead = int(torch.randint(1, min(predictor.max_steps, cut.shape[1]) + 1, ()))  # on the host, which must know it
+    ahead = draw_ahead(predictor, cut.shape[1]) if ahead is None else ahead
     error = predictor(memory, action, observation, steps=ahead)
     known = valid[:, ahead:] & ~cut.unfold(1, ahead, 1).any(-1)
     return error.masked_fill(~known, 0.0).sum() / known.sum().clamp(min=1)
+
+
+def draw_ahead(predictor: ObservationPredictor, steps: int) -> int:
+    """How many steps ahead to predict, of those that the predictor and sequences of ``steps`` steps allow.
+
+    It is drawn on the host, which must know it: shapes depend on it.
+    """
+    return int(torch.randint(1, min(predictor.max_steps, steps) + 1, ()))

@@ -66,6 +66,8 @@ class RunSettings:
     device: str
     threads: int
     precision: str = "fp32"
+    capture: Any = "auto"
+    """Or ``True``, or ``False``."""
     total_frames: int
     steps_per_batch: int
     log_frames: int
@@ -190,6 +192,10 @@ def _check_choices(settings: RunSettings) -> None:
     if settings.device not in ("auto", "cpu", "cuda"):
         raise SettingsError(
             f"device must be auto, cpu or cuda, got {settings.device!r}; auto takes a GPU if there is one."
+        )
+    if settings.capture not in ("auto", True, False):
+        raise SettingsError(
+            f"capture must be auto, true or false, got {shown(settings.capture)}; auto captures on a GPU."
         )
     if settings.init_checkpoint not in ("best", "last"):
         raise SettingsError(

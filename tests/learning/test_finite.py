@@ -10,7 +10,8 @@ NAN, INF = float("nan"), float("inf")
 def watch(guard, place="update 1", *, loss=1.0, first=(0.5, 2.0), second=(3.0,), norm=None):
     gradients = {"first": torch.tensor(first), "second": torch.tensor(second)}
     norm = torch.cat(list(gradients.values())).norm() if norm is None else torch.tensor(norm)
-    return guard.watch(torch.tensor(loss), gradients, norm, place)
+    guard.begin(place)
+    return guard.watch(torch.tensor(loss), gradients, norm)
 
 
 CASES = [
@@ -31,8 +32,8 @@ class TestWhatIsWrong:
     def test_a_fault_is_raised_by_check_on_a_gpu(self, wrong, message):
         """Other updates before and after it change nothing."""
         guard = FiniteGuard(at_once=False)
-        skips = [watch(guard, "update 0"), watch(guard, **wrong), watch(guard, "update 2"), watch(guard, loss=NAN)]
-        assert [skip.item() for skip in skips] == [0.0, 1.0, 1.0, 1.0]
+        updates = ({"place": "update 0"}, wrong, {"place": "update 2"}, {"loss": NAN})
+        assert [watch(guard, **update).item() for update in updates] == [0.0, 1.0, 1.0, 1.0]
         for _ in range(2):
             with pytest.raises(NonFiniteError, match=f"^{message}$"):
                 guard.check()
