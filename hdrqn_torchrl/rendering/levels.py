@@ -63,8 +63,6 @@ class Level:
     note: str = ""
     brief: bool = False
     """Whether it takes one line only: the choice, without bars."""
-    excluded: str = "reached"
-    """Why choices are not allowed."""
 
     def bar(self, index: int) -> float:
         """Length of a bar in [0, 1]: 1 for the best, 0 for a choice that is worse by ``span`` or more, or excluded."""
@@ -75,7 +73,7 @@ class Level:
 
     def remark(self, index: int) -> str:
         """Why a choice has no bar."""
-        return "" if self.decision.allowed[index] else self.excluded
+        return "" if self.decision.allowed[index] else "not now"
 
 
 def levels_of(frame: Frame, spans: BarSpans) -> list[Level]:
@@ -83,7 +81,7 @@ def levels_of(frame: Frame, spans: BarSpans) -> list[Level]:
     scene = frame.scene
     symbol, ink = "Q" if frame.subgoal is None else "Qˢ", [ACTION_COLOUR] * len(scene.action_names)
     note = _chance(frame.action)
-    levels = [Level("does", symbol, frame.action, scene.action_names, ink, spans.action, note, excluded="not now")]
+    levels = [Level("does", symbol, frame.action, scene.action_names, ink, spans.action, note)]
     for nearer in frame.pursuits[:-1]:
         ink = [ACTION_COLOUR] * len(nearer.names)
         levels.insert(0, Level("by way of", "Q", nearer.decision, nearer.names, ink, 1.0, _note(nearer), brief=True))

@@ -43,7 +43,7 @@ def test_masked_choices_have_no_bar_and_are_never_the_best():
     assert decision.best == 1 and not decision.explores
     level = replace(levels_of(walk("v2")[0], BarSpans())[0], decision=decision)
     assert [level.bar(index) for index in range(3)] == [0.0, 1.0, 0.5]
-    assert [level.remark(index) for index in range(3)] == ["reached", "", ""]
+    assert [level.remark(index) for index in range(3)] == ["not now", "", ""]
 
 
 def test_if_nothing_is_allowed_anything_may_be_the_best():

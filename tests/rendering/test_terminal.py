@@ -26,7 +26,7 @@ def test_text_holds_every_fact():
     ):
         assert fact in text
     lines = text.splitlines()
-    assert any("  goal 1 reached" in line and "1.000" in line for line in lines)
+    assert any("  goal 1 not now" in line and "1.000" in line for line in lines)
     assert any("> goal 2 ████████████████  0.500" in line for line in lines)
     assert any("> → right ████████████████  0.500" in line for line in lines)
     assert any("← left  ████████████░░░░  0.250" in line for line in lines)
