@@ -5,7 +5,7 @@ a branch) is what it was at the recording. So a function whose replays give the 
 captured, as far as its operations can.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -20,6 +20,9 @@ class Tape(TorchDispatchMode):
 
     A capture does not do the work, but a CPU can't help it: all memory that existed before is put back afterwards.
 
+    Args:
+        generators: random generators that the work draws from, besides torch's default one.
+
     Examples:
         >>> tape, x, total = Tape(), torch.ones(2), torch.zeros(2)
         >>> y = tape.record(lambda: total.add_(x) * 2)
@@ -31,8 +34,9 @@ class Tape(TorchDispatchMode):
         ([3.0, 3.0], [6.0, 6.0])
     """
 
-    def __init__(self) -> None:
+    def __init__(self, generators: Sequence[torch.Generator] = ()) -> None:
         super().__init__()
+        self._generators = [torch.default_generator, *generators]
         self._calls: list[tuple[Callable, tuple, dict, list[tuple[Tensor, bool]], bool]] = []
         self._before: dict[int, tuple[torch.UntypedStorage, torch.UntypedStorage]] = {}
         self._made: set[int] = set()
@@ -41,13 +45,14 @@ class Tape(TorchDispatchMode):
         return work()
 
     def record(self, work: Callable[[], Any]) -> Any:
-        states = torch.get_rng_state()
+        states = [each.get_state() for each in self._generators]
         with HostWaits() as waits, self:
             result = work()
         assert waits.found == []
         for storage, kept in self._before.values():
             storage.copy_(kept)
-        torch.set_rng_state(states)
+        for each, state in zip(self._generators, states, strict=True):
+            each.set_state(state)
         return result
 
     def __torch_dispatch__(self, function, types, args=(), kwargs=None):

@@ -87,7 +87,7 @@ class Captured:
     def reset(self) -> None:
         """Forgets all recordings: what the function keeps has been replaced."""
         self._inputs: TensorDictBase | None = None
-        self._pieces: dict[Hashable, _Piece] = {}
+        self._pieces: dict[Hashable, Replayed] = {}
 
     def __call__(self, sample: TensorDictBase, variant: Hashable = None) -> dict[str, Tensor]:
         """Does the work for ``sample``.
@@ -104,19 +104,25 @@ class Captured:
         else:
             _copy(sample, self._inputs)
         if variant not in self._pieces:
-            self._pieces[variant] = _Piece(self._make_recording(), self._warm_ups)
+            self._pieces[variant] = Replayed(self._make_recording(), self._warm_ups)
         inputs = self._inputs
         return self._pieces[variant](lambda: self._function(inputs, variant))
 
 
-class _Piece:
-    """The work of one variant."""
+class Replayed:
+    """One piece of work on the same memory: done as it is at first, then recorded, and replayed from then on.
+
+    Args:
+        recording: not used yet.
+        warm_ups: calls before the recording.
+    """
 
     def __init__(self, recording: Recording, warm_ups: int) -> None:
         self._recording, self._left = recording, warm_ups
-        self._results: dict[str, Tensor] | None = None
+        self._results: dict[Any, Tensor] | None = None
 
-    def __call__(self, work: Callable[[], dict[str, Tensor]]) -> dict[str, Tensor]:
+    def __call__(self, work: Callable[[], dict[Any, Tensor]]) -> dict[Any, Tensor]:
+        """Does the work; returns its results, which later calls leave alone."""
         if self._left:
             self._left -= 1
             return self._recording.warm_up(work)

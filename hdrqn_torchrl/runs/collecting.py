@@ -10,7 +10,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.learning.captured import wants_capture
 from hdrqn_torchrl.runs.building import build_algorithm
+from hdrqn_torchrl.runs.captured_collector import CapturedCollector, can_capture
 from hdrqn_torchrl.runs.collectors import ResumableCollector
 from hdrqn_torchrl.runs.settings import RunSettings
 from hdrqn_torchrl.runs.workers import ProcessWorkers, Worker, WorkersCollector
@@ -26,7 +28,7 @@ def make_collector(
     device: str,
     updates: Callable[[], int],
     allowed: Sequence[str] = (),
-) -> ResumableCollector | WorkersCollector:
+) -> ResumableCollector | CapturedCollector | WorkersCollector:
     """This process as the only collector, or workers.
 
     Args:
@@ -44,6 +46,10 @@ def make_collector(
     frames_per_batch = worlds * settings.steps_per_batch
     total_frames = -(-settings.total_frames // frames_per_batch) * frames_per_batch
     transformed = algorithm.transform(env)
+    if chosen.kind == "local" and wants_capture(settings.capture, device) and can_capture(transformed):
+        return CapturedCollector(
+            transformed, algorithm.policy, frames_per_batch=frames_per_batch, total_frames=total_frames
+        )
     if chosen.kind == "local":
         return ResumableCollector(
             transformed,

@@ -19,6 +19,7 @@ from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch
+from hdrqn_torchrl.runs.captured_collector import CapturedCollector
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
 from hdrqn_torchrl.runs.components import components_of, explained
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker
@@ -55,7 +56,7 @@ class Trainer:
     def __init__(
         self,
         algorithm: Algorithm,
-        collector: BaseCollector | WorkersCollector,
+        collector: BaseCollector | CapturedCollector | WorkersCollector,
         *,
         logger: RunLogger,
         evaluate: Callable[[], dict[str, float]],

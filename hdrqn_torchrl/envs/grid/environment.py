@@ -206,9 +206,24 @@ class MultiGoalGridEnv(EnvBase):
         attained, available = self.rules.near_subgoals(before, self.state, goals)
         return {ROOMS.attained: attained, ROOMS.available: available}
 
+    @property
+    def worlds(self) -> dict[str, Tensor]:
+        """All that goes on from step to step, by name; to be set as a whole."""
+        return {**self.state._asdict(), "steps": self.steps}
+
+    @worlds.setter
+    def worlds(self, worlds: dict[str, Tensor]) -> None:
+        self.state = GridState(*(worlds[name] for name in GridState._fields))
+        self.steps = worlds["steps"]
+
+    @property
+    def generators(self) -> list[torch.Generator]:
+        """What steps and resets draw from."""
+        return [self._generator]
+
     def state_dict(self, *args, **kwargs) -> dict[str, Tensor]:
         """All worlds and the generator of their layouts: what a resumed run needs."""
-        return {**self.state._asdict(), "steps": self.steps, "generator": self._generator.get_state()}
+        return {**self.worlds, "generator": self._generator.get_state()}
 
     def load_state_dict(self, state_dict: dict[str, Tensor], strict: bool = True) -> None:
         """Restores what :meth:`state_dict` returned.
