@@ -98,7 +98,7 @@ def make_minigrid(
     make = partial(gymnasium.make, id, **options)
     references = {"random": _reference(make, "random", "chance", id, options)}
     if can_play:
-        references["bot"] = _reference(make, "bot", "BabyAI's bot, which knows the whole map", id, options)
+        references["bot"] = _reference(make, "bot", "BabyAI's bot, which remembers all that it has seen", id, options)
     env.task = replace(env.task, references=references, ceiling="bot" if can_play else None, scene=minigrid_scene)
     return env
 
