@@ -49,7 +49,8 @@ def python_blocks(page: Path) -> list[str]:
 def commands(page: Path) -> list[str]:
     """Command lines in shell blocks, and those in running text."""
     text = page.read_text()
-    lines = "\n".join(re.findall(r"```bash\n(.*?)```", text, flags=re.S)).splitlines()
+    blocks = "\n".join(re.findall(r"```bash\n(.*?)```", text, flags=re.S))
+    lines = re.sub(r"\\\n\s*", "", blocks).splitlines()  # a backslash at the end goes on in the next line
     quoted = re.findall(r"(?<!`)`((?:python |hdrqn |make )[^`\n]+)`(?!`)", text)
     shown = [line.split("  #")[0].strip() for line in [*lines, *quoted] if line.strip() and "..." not in line]
     return [re.sub(r"(?<=\s)\[([^\]]*)\](?=\s|$)", r"\1", line) for line in shown]  # [what may be left out]
