@@ -5,7 +5,7 @@ ARGS ?=
 # Processes that `make test` shares the tests among, 2 GB each. Plain `pytest -m 'not slow'` does without.
 WORKERS ?= 2
 
-.PHONY: setup train test test-slow lint examples clean
+.PHONY: setup train test test-slow test-gpu lint examples clean
 
 setup: .venv/.ready
 
@@ -23,6 +23,10 @@ test: setup lint examples
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow $(ARGS)
+
+# What only a GPU can show; all of it is skipped without one.
+test-gpu: setup
+	$(BIN)/python -m pytest tests/gpu tests/test_devices.py $(ARGS)
 
 lint: setup
 	$(BIN)/ruff check .
