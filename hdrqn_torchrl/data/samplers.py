@@ -54,10 +54,10 @@ class StepSliceSampler(SliceSampler):
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        first, lengths, starts = self._episodes(storage)
+        first, lengths, starts, total = self._episodes(storage)
         length, count = self._adjusted_batch_size(batch_size)
         ends = starts.cumsum(0)
-        step = torch.randint(int(ends[-1]), (count,), device=ends.device, generator=self._rng)
+        step = torch.randint(total, (count,), device=ends.device, generator=self._rng)
         episode = torch.searchsorted(ends, step, right=True)
         passed = step - ends[episode] + starts[episode]  # steps of the episode before the slice
         start = first[episode]
@@ -77,11 +77,11 @@ class StepSliceSampler(SliceSampler):
     def _find(self, storage: Storage) -> _Episodes:
         first, stop, lengths = self._get_stop_and_length(storage)
         if self.terminated_key is None:
-            return _Episodes(first, lengths, lengths)
+            return _Episodes(first, lengths, lengths, int(lengths.sum()))
         terminated = storage[:].get(self.terminated_key)[stop.unbind(-1)].flatten()
         starts = lengths - (~terminated).long()
         known = starts.nonzero().squeeze(-1)
-        return _Episodes(first[known], lengths[known], starts[known])
+        return _Episodes(first[known], lengths[known], starts[known], int(starts.sum()))
 
 
 class _Episodes(NamedTuple):
@@ -93,6 +93,8 @@ class _Episodes(NamedTuple):
     """How many steps of each are stored, ``[E]``."""
     starts: Tensor
     """At how many of them, from the first on, a slice can start, ``[E]``."""
+    total: int
+    """At how many of all; the host reads it once after a write instead of at every draw."""
 
 
 class EpisodeSliceSampler(StepSliceSampler):
@@ -120,7 +122,7 @@ class EpisodeSliceSampler(StepSliceSampler):
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
-        first, lengths, starts = self._episodes(storage)
+        first, lengths, starts, _ = self._episodes(storage)
         length, count = self._adjusted_batch_size(batch_size)
         episode = torch.randint(len(lengths), (count,), device=lengths.device, generator=self._rng)
         start = first[episode]
@@ -156,7 +158,7 @@ class WholeEpisodeSampler(StepSliceSampler):
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
         """Draws ``batch_size // slice_len`` slices; returns their indices, one tensor per storage dimension."""
         length, count = self._adjusted_batch_size(batch_size)
-        first, lengths, _ = self._episodes(storage)
+        first, lengths, *_ = self._episodes(storage)
         if not len(first):  # the ring has overwritten the beginning of every episode
             raise RuntimeError("no stored episode has its first step; raise capacity above the length of an episode.")
         chosen = torch.randint(len(first), (count,), device=first.device, generator=self._rng)
@@ -166,7 +168,8 @@ class WholeEpisodeSampler(StepSliceSampler):
         """Those whose first step is stored."""
         found = super()._find(storage)
         whole = storage[:].get(self.first_key)[found.first.unbind(-1)].flatten().nonzero().squeeze(-1)
-        return _Episodes(*(part[whole] for part in found))
+        starts = found.starts[whole]
+        return _Episodes(found.first[whole], found.lengths[whole], starts, int(starts.sum()))
 
 
 class EpisodeStartSampler(SliceSampler):
