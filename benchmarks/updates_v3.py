@@ -44,7 +44,7 @@ class RawNetwork(nn.Module):
         layers = network.memory, network.sub_head, network.meta_head
         self.lstm, self.sub_head, self.meta_head = (deepcopy(layer) for layer in layers)
         self.codes, self.actions = network.features._one_hot, torch.eye(network.num_actions)
-        self.subgoals, self.hidden = network.num_subgoals, network.hidden_size
+        (self.subgoals,), self.hidden = network.num_subgoals, network.hidden_size
 
     def forward(self, batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
         """Q-values ``[B, T, G, A]`` and ``[B, T, G]``, and the LSTM's output ``[B, T, H]``."""
@@ -100,7 +100,7 @@ class RawLearner:
     """Q(lambda) for all subgoals and both levels with two networks, fused Adam and a soft target update."""
 
     def __init__(self, learner: Learner, precision: str) -> None:
-        online, target = (policy.network for policy in learner.loss._policies)
+        online, target = (policy.network for policy in learner.loss._networks)
         self.online, self.target = RawNetwork(online), RawNetwork(online).requires_grad_(False)
         for parameter, (name, _) in zip(self.target.parameters(), online.named_parameters(), strict=True):
             parameter.copy_(attrgetter(name)(target))  # those of the target are buffers
