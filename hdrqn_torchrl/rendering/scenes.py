@@ -110,7 +110,13 @@ class PlainScene:
         """The observation in numbers."""
         if self.observation is None:
             return Text("no picture")
-        return Text(_cut(np.array2string(self.observation, precision=2, threshold=200, max_line_width=_LONGEST_LINE)))
+        return Text(
+            _cut(
+                np.array2string(
+                    self.observation, precision=2, threshold=200, max_line_width=_LONGEST_LINE, suppress_small=True
+                )
+            )
+        )
 
 
 def _rendered(env: EnvBase) -> NDArray[np.uint8] | str | None:
