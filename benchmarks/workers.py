@@ -47,7 +47,7 @@ def frames_per_second(kind: str, workers: int, *, worlds: int, steps: int, sync:
     agent: Algorithm
     env, agent = agent_of(worlds, 0)
     collector = WorkersCollector(
-        place, agent.transform(env), agent.policy, workers=workers, frames_per_batch=worlds * steps,
+        place, agent.transform(env), agent.policy, workers=workers,
         total_frames=10**12, sync=sync,
     )  # fmt: skip
     batches = iter(collector)

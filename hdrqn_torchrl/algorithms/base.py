@@ -46,6 +46,11 @@ class Algorithm:
     levels: tuple[LevelView, ...] = ()
     task: Task = field(default_factory=Task)
 
+    @property
+    def updates(self) -> int:
+        """Gradient steps of all learners together."""
+        return sum(learner.updates for learner in self.learners.values())
+
     def transform(self, env: EnvBase) -> TransformedEnv:
         """The environment with the transforms that this algorithm needs."""
         return TransformedEnv(env, self.make_transforms(), auto_unwrap=True)

@@ -242,7 +242,6 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
         env,
         algorithm,
         device=device,
-        updates=lambda: sum(learner.updates for learner in algorithm.learners.values()),
         allowed=allowed,
     )
     trainer = Trainer(

@@ -12,8 +12,7 @@ _LARGEST = 1e4  # beyond it a bound says only that there is none
 class ScaledVector(nn.Module):
     """Maps entries from their bounds to [-1, 1]; entries without bounds stay as they are.
 
-    What is bounded by 0.4 and matters by its changes, such as the angle of a pole, is otherwise learned from much more
-    slowly than what is bounded by 5.
+    So what is bounded by 0.4, such as the angle of a pole, weighs as much at first as what is bounded by 5.
 
     Args:
         spec: of vectors ``[N, D]``.

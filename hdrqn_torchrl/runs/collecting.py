@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 from tensordict.nn import TensorDictModuleBase
@@ -26,7 +26,6 @@ def make_collector(
     algorithm: Algorithm,
     *,
     device: str,
-    updates: Callable[[], int],
     allowed: Sequence[str] = (),
 ) -> ResumableCollector | CapturedCollector | WorkersCollector:
     """This process as the only collector, or workers.
@@ -36,7 +35,6 @@ def make_collector(
         env: bare environment of all worlds.
         algorithm: made for it.
         device: of this process; workers act on CPUs.
-        updates: number of gradient steps so far.
         allowed: see :func:`~hdrqn_torchrl.runs.building.build`.
 
     Raises:
@@ -72,11 +70,10 @@ def make_collector(
         transformed,
         algorithm.policy,
         workers=chosen.workers,
-        frames_per_batch=frames_per_batch,
         total_frames=total_frames,
         sync=chosen.sync,
         seed=settings.seed,
-        updates=updates,
+        updates=lambda: algorithm.updates,
         patience_seconds=chosen.patience_seconds,
     )
 

@@ -18,6 +18,7 @@ from torchrl.checkpoint import CheckpointError
 from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.learning import Monitor
 from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
@@ -88,7 +89,13 @@ class Trainer:
     @property
     def updates(self) -> int:
         """Gradient steps of all learners together."""
-        return sum(learner.updates for learner in self.algorithm.learners.values())
+        return self.algorithm.updates
+
+    @property
+    def _reporting(self) -> list[Monitor | WorkersCollector]:
+        """All that has figures for a row."""
+        workers = [self.collector] if isinstance(self.collector, WorkersCollector) else []
+        return [*self.algorithm.monitors.values(), *workers]
 
     def train(self) -> None:
         """Runs to ``total_frames``.
@@ -170,10 +177,8 @@ class Trainer:
             **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
             **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
         }
-        for monitor in self.algorithm.monitors.values():
+        for monitor in self._reporting:
             row |= monitor.metrics()
-        if isinstance(self.collector, WorkersCollector):
-            row |= self.collector.metrics()
         best = False
         if evaluation:
             with self._stop.at_once():
@@ -192,10 +197,8 @@ class Trainer:
     def _begin_row(self) -> None:
         """Starts counting again; only now that a row is on the disk: a stop before would lose what was counted."""
         self._window = Window(self.frames)
-        for monitor in self.algorithm.monitors.values():
+        for monitor in self._reporting:
             monitor.clear()
-        if isinstance(self.collector, WorkersCollector):
-            self.collector.clear()
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint of the whole training, unless nothing happened since the last one.

@@ -34,7 +34,6 @@ class WorkersCollector:
         env: transformed environment of all N worlds, which is not stepped: its specs check what is loaded.
         policy: whose weights the workers are sent.
         workers: W; each has N / W worlds.
-        frames_per_batch: N x T.
         total_frames: environment frames to collect.
         sync: workers wait for new weights; ``False``: they collect the next batch while the learner learns from the
             last one, with weights that are one round old. They are never further ahead.
@@ -55,7 +54,6 @@ class WorkersCollector:
         policy: TensorDictModuleBase,
         *,
         workers: int,
-        frames_per_batch: int,
         total_frames: int,
         sync: bool = True,
         seed: int = 0,
@@ -66,7 +64,7 @@ class WorkersCollector:
         if not patience_seconds > 0:
             raise ValueError(f"patience_seconds must be > 0, got {patience_seconds}; use 300.")
         self.place, self.env, self.policy, self.sync = place, env, policy, sync
-        self.frames_per_batch, self.total_frames, self.seed = frames_per_batch, total_frames, seed
+        self.total_frames, self.seed = total_frames, seed
         self.updates, self.patience_seconds = updates, patience_seconds
         self.frames = 0
         self.worlds = env.batch_size[0] // workers

@@ -23,7 +23,7 @@ def stamped(agent: str, workers: int, *, place=None, **arguments) -> tuple[Algor
     algorithm = AGENTS[agent](env)
     place = place or HereWorkers(partial(make_part, agent, WORLDS // workers))
     collector = WorkersCollector(
-        place, algorithm.transform(env), algorithm.policy, workers=workers, frames_per_batch=WORLDS * STEPS,
+        place, algorithm.transform(env), algorithm.policy, workers=workers,
         **{"total_frames": 10**9, **arguments},
     )  # fmt: skip
     return algorithm, collector
@@ -156,7 +156,7 @@ def test_one_worker_that_is_waited_for_is_no_other_than_none():
     expected = learned(algorithm, local, 10)
     algorithm, env = parts()
     place = HereWorkers(partial(make_grid_part, 4))
-    collector = WorkersCollector(place, env, algorithm.policy, workers=1, frames_per_batch=32, total_frames=320, seed=5)
+    collector = WorkersCollector(place, env, algorithm.policy, workers=1, total_frames=320, seed=5)
     found = learned(algorithm, collector, 10)
     for one, other in zip(found, expected, strict=True):
         assert (one["action"] == other["action"]).all()
@@ -236,3 +236,10 @@ def test_a_state_of_another_number_of_workers_is_refused():
         other.load_state_dict(state)
     with pytest.raises(ValueError, match="the state of a collector without workers"):
         other.load_state_dict({})
+    algorithm = AGENTS["v3"](StampedWorlds(WORLDS))
+    local = ResumableCollector(
+        algorithm.transform(StampedWorlds(WORLDS)), algorithm.policy, frames_per_batch=WORLDS * STEPS, total_frames=-1,
+        auto_register_policy_transforms=False,
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="collector must be one with 2 workers, as before, got local"):
+        local.load_state_dict(state)

@@ -28,7 +28,7 @@ def collector_of(make, *, workers=2, **arguments):
     algorithm = AGENTS["v3"](env)
     place = ProcessWorkers(partial(Worker, make, steps=8, all_worlds=WORLDS, threads=1))
     return WorkersCollector(
-        place, algorithm.transform(env), algorithm.policy, workers=workers, frames_per_batch=WORLDS * 8,
+        place, algorithm.transform(env), algorithm.policy, workers=workers,
         **{"total_frames": 10**9, "sync": False, **arguments},
     )  # fmt: skip
 

@@ -47,9 +47,7 @@ def collector_at(place):
     torch.manual_seed(0)
     algorithm = AGENTS["v3"](StampedWorlds(WORLDS, seed=0))
     env = algorithm.transform(StampedWorlds(WORLDS, seed=0))
-    return WorkersCollector(
-        place, env, algorithm.policy, workers=2, frames_per_batch=WORLDS * 8, total_frames=10**9, sync=False
-    )
+    return WorkersCollector(place, env, algorithm.policy, workers=2, total_frames=10**9, sync=False)
 
 
 def test_a_killed_worker_is_replaced_and_only_loopback_listens(cluster):
