@@ -140,12 +140,10 @@ def test_a_run_collects_so_where_it_captures(as_on_gpu, monkeypatch):
     settings = SimpleNamespace(
         capture=True, collector=SimpleNamespace(kind="local"), steps_per_batch=4, total_frames=48
     )
-    collector = collecting.make_collector(settings, env, algorithm, device="cpu", updates=lambda: 0)
+    collector = collecting.make_collector(settings, env, algorithm, device="cpu")
     assert isinstance(collector, CapturedCollector) and [batch.shape for batch in collector] == [(6, 4)] * 2
     settings.capture = False
-    assert isinstance(
-        collecting.make_collector(settings, env, algorithm, device="cpu", updates=lambda: 0), ResumableCollector
-    )
+    assert isinstance(collecting.make_collector(settings, env, algorithm, device="cpu"), ResumableCollector)
 
 
 def test_only_known_tensor_programs_are_captured():
