@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +10,10 @@ from contextlib import contextmanager
 import numpy
 import torch
 from torch import Tensor
+
+WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
+"""Variable that cuBLAS reads once."""
+_WORKSPACES = (":16:8", ":4096:8")  # with which it repeats its sums; cuDNN's LSTM does with the first
 
 
 def on_host(tensor: Tensor) -> bool:
@@ -33,6 +38,40 @@ def autocast_dtype(tensor: Tensor) -> torch.dtype | None:
     if not torch.amp.is_autocast_available(kind) or not torch.is_autocast_enabled(kind):
         return None
     return torch.get_autocast_dtype(kind)
+
+
+def set_deterministic(deterministic: bool, kind: str) -> None:
+    """Whether a GPU gives the same numbers for the same program, bit for bit; for the whole process.
+
+    Operations that can't are then errors. Captured graphs consist of the kernels that were chosen at their recording,
+    so it must be set before. A CPU repeats its numbers anyway: nothing is changed there.
+
+    Args:
+        deterministic: ``False``: the fastest kernels, some of which add in any order.
+        kind: of device, ``"cpu"`` or ``"cuda"``.
+
+    Raises:
+        ValueError: if cuBLAS has begun, or was told, otherwise.
+    """
+    if kind != "cuda":
+        return
+    if deterministic:
+        _set_workspace()
+    torch.use_deterministic_algorithms(deterministic)
+    torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = deterministic, False
+
+
+def _set_workspace() -> None:
+    found = os.environ.get(WORKSPACE)
+    if found in _WORKSPACES:
+        return
+    if found is not None or torch.cuda.is_initialized():
+        what = "nothing, and the GPU is in use, so that it is too late" if found is None else repr(found)
+        raise ValueError(
+            f"{WORKSPACE} must be {' or '.join(_WORKSPACES)} with deterministic=true, got {what}; set it before the "
+            f"program starts: {WORKSPACE}={_WORKSPACES[0]}."
+        )
+    os.environ[WORKSPACE] = _WORKSPACES[0]
 
 
 @contextmanager

@@ -207,6 +207,7 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     import numpy
     import torch
 
+    from hdrqn_torchrl.devices import set_deterministic
     from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.envs.specs import interface_differences
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
@@ -218,6 +219,7 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
 
     config = run.config
     device = pick_device(config.device, torch.cuda.is_available())
+    set_deterministic(config.deterministic, device)
     random.seed(config.seed)
     numpy.random.seed(config.seed)
     torch.manual_seed(config.seed)

@@ -43,7 +43,9 @@ class RandomState(GlobalRNGState):
             raise ValueError(
                 "the stored state of numpy's random numbers must be one of MT19937; use another checkpoint."
             )
-        super().load_state_dict(state_dict)
+        of_gpus = state_dict.get("torch_cuda", ())[: torch.cuda.device_count()]  # a machine may have fewer, or none
+        rest = {name: state for name, state in state_dict.items() if name != "torch_cuda"}
+        super().load_state_dict(rest | ({"torch_cuda": of_gpus} if of_gpus else {}))
 
 
 class Checkpoints:

@@ -17,7 +17,7 @@ BOOKKEEPING = (
     "collector.patience_seconds",
 )
 """May differ when a run goes on."""
-NOT_LEARNED_FROM = (*BOOKKEEPING, "logger", "device", "threads", "log_frames")
+NOT_LEARNED_FROM = (*BOOKKEEPING, "logger", "device", "deterministic", "threads", "log_frames")
 """These do not affect learning: runs that differ in no other setting are the same training."""
 NOT_COMPARED = (*NOT_LEARNED_FROM, "seed", "evaluation")
 """Runs that differ in these may be averaged."""

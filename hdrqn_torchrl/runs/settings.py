@@ -68,6 +68,8 @@ class RunSettings:
     precision: str = "fp32"
     capture: Any = "auto"
     """Or ``True``, or ``False``."""
+    deterministic: bool = False
+    """Whether a GPU repeats its numbers bit for bit."""
     total_frames: int
     steps_per_batch: int
     log_frames: int
