@@ -119,7 +119,7 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
 
     diary, orphans, began = Diary(folder / "diary.jsonl"), leftovers(folder), time.monotonic()
 
-    def build_run(run):
+    def build_run(run, stop):
         own_seed = 99 if any((folder / "checkpoints").glob("checkpoint-*")) else seed
         seed_everything(own_seed)
         trainer = make_training(folder, name, seed=own_seed, **settings)
@@ -138,8 +138,8 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
         learner.store, trainer.checkpoints.save = noted_store, noted_save
         return trainer, None, {}
 
-    def noted_begin(run):
-        trainer, *rest = begin(run)
+    def noted_begin(run, stop):
+        trainer, *rest = begin(run, stop)
         seconds = time.monotonic() - began
         diary.note("start", frames=trainer.frames, orphans=orphans, left=leftovers(folder), seconds=seconds)
         return trainer, *rest

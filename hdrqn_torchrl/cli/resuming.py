@@ -48,6 +48,8 @@ class Plan:
     """Where it goes on; ``None``: at the run's newest checkpoint."""
     weights: Path | None = None
     """What it begins with instead of random weights."""
+    label: str = ""
+    """Names it among others that share this process, whose progress bars would overwrite each other."""
 
 
 def plan(config: RunSettings, folder: Path) -> Plan:

@@ -8,7 +8,7 @@ import os
 import random
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
+from hdrqn_torchrl.cli.together import plans, train_together
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build, build_algorithm, build_env
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from hdrqn_torchrl.algorithms import Algorithm
+    from hdrqn_torchrl.runs.interruption import StopRequest
     from hdrqn_torchrl.runs.references import Players
     from hdrqn_torchrl.runs.trainer import Trainer
 
@@ -53,11 +55,17 @@ def composed(config: DictConfig) -> float:
     try:
         settings = resolved(config)
         check(settings)
+        if settings.seeds is not None:
+            runs = plans(config, folder)
+            load(settings.threads)
+            return train_together(runs, pieces)
         run = plan(settings, folder)
         return train(run)
     except KeyboardInterrupt as stop:
-        folder = folder if run is None else run.folder
-        print(f"{str(stop) or 'stopped'}; `{command(folder, config.allowed_targets)}` goes on", file=sys.stderr)
+        told = str(stop) or "stopped"
+        if config.seeds is None:
+            told += f"; `{command(folder if run is None else run.folder, config.allowed_targets)}` goes on"
+        print(told, file=sys.stderr)
         sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
     except Exception as error:
         if run is None and not layout.holds_run(folder):
@@ -68,24 +76,39 @@ def composed(config: DictConfig) -> float:
 
 
 def train(run: Plan) -> float:
-    """One training run, from its beginning or from a checkpoint."""
+    """One training run, from its beginning or from a checkpoint; returns its final greedy return."""
+    load(run.config.threads)
+    from hdrqn_torchrl.runs.interruption import StopRequest
+    from hdrqn_torchrl.runs.together import finish
+
+    return finish(pieces(run, StopRequest()))
+
+
+def load(threads: int) -> None:
+    """Loads torch and torchrl, which take seconds; --help and --cfg do without them."""
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
-    # torch and torchrl take seconds to load; --help and --cfg do without them.
     import torch
+    import torchrl  # noqa: F401
+
+    torch.set_num_threads(threads)
+
+
+def pieces(run: Plan, stop: StopRequest) -> Generator[None, None, float]:
+    """:func:`train` in pieces, between which other trainings of this process may have their turns."""
     from torchrl.checkpoint import CheckpointError
 
     from hdrqn_torchrl.runs.folder import locked
 
-    torch.set_num_threads(run.config.threads)
     patience = sweeps.PATIENCE_SECONDS if sweeps.is_sweep() else 0.0
     with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
         refused = (ValueError, CheckpointError) if run.resumed else ()
         with noting_errors(run, unless=refused):
-            trainer, evaluation_env, players = begin(run)
+            trainer, evaluation_env, players = begin(run, stop)
+        yield
         with noting_errors(run):
             try:
-                trainer.train()
+                yield from trainer.pieces()
             finally:
                 trainer.collector.shutdown()
             return write_summary(run, trainer, evaluation_env, players)["return_mean"]
@@ -151,7 +174,7 @@ def note_error(folder: Path) -> None:
         write_whole(folder / layout.ERROR, traceback.format_exc())
 
 
-def begin(run: Plan) -> tuple[Trainer, EnvBase, Players]:
+def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:
     """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
@@ -164,7 +187,7 @@ def begin(run: Plan) -> tuple[Trainer, EnvBase, Players]:
     stale = [*run.folder.glob("*.partial*"), *([run.folder / layout.METRICS] if start is None else [])]
     for path in stale:
         remove(path)
-    trainer, evaluation_env, players = build_run(run)
+    trainer, evaluation_env, players = build_run(run, stop)
     if start is not None:
         trainer.resume(start)
     elif run.config.init_from is not None:
@@ -202,7 +225,7 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players:
     return summary
 
 
-def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
+def build_run(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:
     """Everything that a run needs: trainer, evaluation environment, and what finds the scripted players' figures."""
     import numpy
     import torch
@@ -256,7 +279,8 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
                 build(logger, run.folder, place=f"logger.loggers[{index}]", allowed=allowed)
                 for index, logger in enumerate(config.logger["loggers"])
             ],
-            label=run.folder.name if sweeps.is_sweep() else "",
+            label=run.label or (run.folder.name if sweeps.is_sweep() else ""),
+            bar=not run.label,
         ),
         evaluate=lambda: evaluate(
             evaluation_env,
@@ -274,5 +298,6 @@ def build_run(run: Plan) -> tuple[Trainer, EnvBase, Players]:
         checkpoint_frames=config.checkpoint.interval_frames,
         checkpoint_seconds=60.0 * config.checkpoint.interval_minutes,
         ceiling=players.ceiling,
+        stop=stop,
     )
     return trainer, evaluation_env, players

@@ -33,6 +33,8 @@ class StopRequest:
     """Remembers a SIGINT or SIGTERM until :meth:`check` is called; a second one, later than a second
     after the first, is a KeyboardInterrupt at once.
 
+    It can be entered again inside: whoever enters it first hears of the signals.
+
     Examples:
         >>> with StopRequest() as stop:
         ...     stop.check()  # nobody asked
@@ -48,15 +50,22 @@ class StopRequest:
         self._requested: int | None = None
         self._requested_at = 0.0
         self._at_once = False
+        self._depth = 0
         self._former: dict[int, object] = {}
 
     def __enter__(self) -> StopRequest:
+        self._depth += 1
+        if self._depth > 1:
+            return self
         self._requested = None
         if threading.current_thread() is threading.main_thread():  # Python allows handlers nowhere else
             self._former = {number: signal.signal(number, self._handle) for number in SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._depth -= 1
+        if self._depth:
+            return
         for number, handler in self._former.items():
             signal.signal(number, handler)  # type: ignore[arg-type]
         self._former = {}

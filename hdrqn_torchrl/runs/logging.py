@@ -106,6 +106,7 @@ class RunLogger:
         loggers: any TorchRL loggers (TensorBoard, W&B, ...); scalars are logged under their column's name.
         console: where progress goes; a terminal shows a bar, anything else a line per greedy evaluation.
         label: put before those lines, to tell the runs of a sweep apart.
+        bar: whether a terminal shows a bar.
     """
 
     def __init__(
@@ -116,10 +117,12 @@ class RunLogger:
         loggers: list[Logger] | None = None,
         console: Console | None = None,
         label: str = "",
+        bar: bool = True,
     ) -> None:
         self.label = f"{label}  " if label else ""
         self.csv, self.loggers = CSVLog(folder / layout.METRICS), loggers or []
         self.console = console or Console(file=sys.stderr)
+        self._bar = bar and self.console.is_terminal
         self._progress = Progress(
             TextColumn("{task.percentage:>3.0f}%"),
             BarColumn(bar_width=20),
@@ -127,7 +130,7 @@ class RunLogger:
             TimeRemainingColumn(),
             TextColumn("{task.fields[numbers]}"),
             console=self.console,
-            disable=not self.console.is_terminal,
+            disable=not self._bar,
         )
         self._task = self._progress.add_task("training", total=total_frames, numbers="")
         self._progress.start()
@@ -150,7 +153,7 @@ class RunLogger:
             self._last_greedy = f"greedy {row['greedy/return']:+.2f}{ceiling}{success}"
         numbers = progress_line(row, self._last_greedy)
         self._progress.update(self._task, completed=frames, numbers=numbers)
-        if evaluated and not self.console.is_terminal:
+        if evaluated and not self._bar:
             self.console.print(f"{self.label}{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
 
     def _go_on(self) -> None:

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Any, get_type_hints
 
 from hdrqn_torchrl.runs.arguments import Settings, SettingsError, fits, in_words, remedy, shown
+from hdrqn_torchrl.runs.seeds import check_together
 from hdrqn_torchrl.runs.trust import check_targets
 
 
@@ -63,6 +64,8 @@ class RunSettings:
     network: dict[str, Any]
     logger: dict[str, Any]
     seed: int
+    seeds: Any = None
+    """Of several trainings in one process: ``"0..9"`` or ``[0, 1, 2]``; the settings of each have ``None``."""
     device: str
     threads: int
     precision: str = "fp32"
@@ -191,6 +194,8 @@ def _check_collector(collector: CollectorSettings) -> None:
 
 
 def _check_choices(settings: RunSettings) -> None:
+    if settings.seeds is not None:
+        check_together(settings.seeds, settings.logger, settings.resume)
     if settings.device not in ("auto", "cpu", "cuda"):
         raise SettingsError(
             f"device must be auto, cpu or cuda, got {settings.device!r}; auto takes a GPU if there is one."

@@ -52,6 +52,7 @@ class Trainer:
         checkpoint_seconds: seconds after which one is written in any case.
         ceiling: asked at every greedy evaluation for the return of a scripted player, which is logged next to the
             agent's; ``None`` if there is none.
+        stop: asked for at safe points; several trainings of a process share one.
     """
 
     def __init__(
@@ -68,6 +69,7 @@ class Trainer:
         checkpoint_frames: int = 50_000,
         checkpoint_seconds: float = 600.0,
         ceiling: Callable[[], float | None] = lambda: None,
+        stop: StopRequest | None = None,
     ) -> None:
         self.algorithm, self.collector, self.logger, self.evaluate = algorithm, collector, logger, evaluate
         self.total_frames, self.log_frames, self.evaluation_frames = total_frames, log_frames, evaluation_frames
@@ -77,7 +79,7 @@ class Trainer:
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
         self._tracker = EpisodeTracker(algorithm.task)
         self._window = Window()
-        self._stop = StopRequest()
+        self._stop = stop or StopRequest()
         self._started = self._saved_at = time.monotonic()
         self._saved_position: tuple | None = None
 
@@ -105,18 +107,31 @@ class Trainer:
             NonFiniteError: before a NaN or an infinity reaches the weights.
             CheckpointError: if the training can't be saved.
         """
+        for _ in self.pieces():
+            pass
+
+    def pieces(self) -> Iterator[None]:
+        """:meth:`train` in pieces, between which another training may have its turn.
+
+        A piece ends where the host would wait for the device.
+
+        Raises:
+            Exception: as :meth:`train`.
+        """
         try:
             with self._stop:
-                self._run()
+                yield from self._run()
         finally:
             self.logger.close()
 
-    def _run(self) -> None:
+    def _run(self) -> Iterator[None]:
         try:
-            self._complete_iteration()
+            yield from self._complete_iteration()
             if self.frames < self.total_frames:
                 for batch in self.collector:
-                    self.step(batch)
+                    yield
+                    self._receive(batch)
+                    yield from self._complete_iteration()
                     if self.frames >= self.total_frames:
                         break
             self.save()
@@ -130,7 +145,8 @@ class Trainer:
     def step(self, batch: TensorDictBase) -> None:
         """One iteration on a collected batch ``[N, T]``."""
         self._receive(batch)
-        self._complete_iteration()
+        for _ in self._complete_iteration():
+            pass
 
     def _receive(self, batch: TensorDictBase) -> None:
         """Counts and stores a collected batch ``[N, T]``."""
@@ -141,13 +157,15 @@ class Trainer:
         self.episodes += len(finished)
         self._window.add_episodes(finished)
 
-    def _complete_iteration(self) -> None:
+    def _complete_iteration(self) -> Iterator[None]:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
         for name, learner in self.algorithm.learners.items():
             with _naming(name):
                 for _ in range(learner.updates_due()):
                     self._stop.check()
                     self._window.add_update(name, learner.learn())
+            yield
+            with _naming(name):
                 learner.check_finite()
         self.collector.update_policy_weights_()
         before, best = self._completed, False
