@@ -8,6 +8,7 @@ from helpers import ALGORITHMS, build, house, make_collector, small_env
 from tape import Tape
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import RewardSum
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hdrqn_torchrl.data import Continuity
 from hdrqn_torchrl.envs.grid.rules import GridRules, GridState
@@ -151,3 +152,35 @@ def test_only_known_tensor_programs_are_captured():
     transformed = algorithm.transform(env)
     assert can_capture(transformed) and not can_capture(env)
     assert not can_capture(TransformedEnv(transformed, RewardSum()))
+
+
+COMPILED = [
+    pytest.param(*each, id=id, marks=[pytest.mark.slow] if id in ("hdqn-2", "v1-2", "v2-3", "v3-1", "v3-3") else [])
+    for each, id in zip(EVERY, IDS, strict=True)
+]
+
+
+@pytest.mark.parametrize(("name", "levels"), COMPILED)
+def test_a_step_of_acting_depends_on_no_value(name, levels, as_on_gpu):
+    """So says the compiler, which refuses what the host would have to look into: policy, worlds, transforms."""
+    algorithm, worlds = make(name, levels)
+    worlds._generator = None  # torch's own: the compiler knows no other
+    env = algorithm.transform(worlds)
+
+    def act(root):
+        return env.step(algorithm.policy(root))
+
+    roots = [env.reset()]
+    for _ in range(2):
+        roots.append(env.step_mdp(act(roots[-1].clone())))
+    torch.compiler.reset()
+    compiled = torch.compile(act, fullgraph=True, backend="eager", dynamic=False)
+    with set_exploration_type(ExplorationType.RANDOM), torch.no_grad():
+        for root, stance in zip(roots[1:], ("default", "fail_on_recompile"), strict=True):
+            before, results = worlds.worlds, []
+            for work in (act, compiled):
+                worlds.worlds = before
+                torch.manual_seed(5)
+                with torch._dynamo.config.patch(allow_rnn=True), torch.compiler.set_stance(stance):
+                    results.append(work(root.clone()))
+            check_equal(results[:1], results[1:])
