@@ -39,7 +39,7 @@ def frames_per_second(kind: str, workers: int, *, worlds: int, steps: int, sync:
     """Of so many workers, after two rounds."""
     make = partial(Worker, partial(part, worlds // workers), steps=steps, all_worlds=worlds, threads=1)
     if kind == "ray":
-        from hdrqn_torchrl.runs.workers.ray_cluster import RayWorkers
+        from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
 
         place = RayWorkers(make, workers=workers)
     else:

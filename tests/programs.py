@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 
 from processes import ROOT
 
@@ -16,6 +17,14 @@ TINY = [
 ]  # fmt: skip
 TINY_LEVEL = ("batch_size=4", "warmup_frames=200", "frames_per_update=100")
 TINY_HDRQN = [f"algo.{level}.{setting}" for level in ("sub", "meta") for setting in TINY_LEVEL]
+
+
+def wait_until(condition, seconds=120):
+    """Waits, but not for ever."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.1)
 
 
 def call(folder, *arguments):

@@ -1,7 +1,8 @@
 """Sweeps: a failed job does not end the others, what is unfinished is listed at the end, Ctrl-C reaches every worker.
 
 Hydra calls :class:`Sweep` around the jobs of ``python train.py -m ...`` (``hydra.callbacks`` in conf/config.yaml). They
-run in this process, or with ``sweep=parallel`` in worker processes that take one job after the other.
+run in this process, with ``sweep=parallel`` in worker processes that take one job after the other, or elsewhere
+(:mod:`~hdrqn_torchrl.cli.launchers`).
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
@@ -26,11 +28,17 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 POLL_SECONDS = 1.0
 PATIENCE_SECONDS = 120.0
 """How long a job waits for another process in its folder: one of a killed sweep may still be saving itself."""
 STARTED, DONE = "started", "done"
+NOT_STARTED = "not started, as the sweep was stopped"
 Note = dict[str, Any]
 
 
@@ -46,7 +54,7 @@ class Sweep(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """In the main process, before all jobs."""
-        ledger = Path(config.hydra.sweep.dir) / "jobs.jsonl"
+        ledger = ledger_of(config)
         self.ledger = ledger.absolute()  # jobs may have other working directories
         self.ledger.unlink(missing_ok=True)
         atexit.register(report, ledger)  # Hydra leaves out on_multirun_end when a sweep ends with an exception
@@ -74,9 +82,7 @@ class Sweep(Callback):
             reason = one_line(error)
             sys.stderr.write(f"job {config.hydra.job.num}: {reason}\n")
             self._note(config, reason)
-            job_return.return_value = RuntimeError(reason)  # it can be pickled, whatever the error was
-            if config.hydra.sweeper._target_.endswith(".BasicSweeper"):
-                job_return.status = JobStatus.COMPLETED  # that sweeper would raise the first error and show no other
+            _fail(job_return, config, reason)
         else:
             self._note(config, DONE)
 
@@ -89,16 +95,49 @@ class Sweep(Callback):
 
     def _note(self, config: DictConfig, state: str) -> None:
         assert self.ledger is not None
-        if _stop.orphaned:
-            return  # the same command may have been started again: the ledger now belongs to that sweep
-        note = {
-            "job": config.hydra.job.num,
-            "folder": os.path.relpath(config.hydra.runtime.output_dir, config.hydra.runtime.cwd),
-            "overrides": list(config.hydra.overrides.task),
-            "state": state,
-        }
-        with self.ledger.open("a") as file:
-            file.write(json.dumps(note) + "\n")  # in one piece, as other processes write here, too
+        if not _stop.orphaned:  # else the same command may have been started again: the ledger belongs to that sweep
+            _write(self.ledger, config, config.hydra.runtime.output_dir, state)
+
+
+def _write(ledger: Path, config: DictConfig, folder: str, state: str) -> None:
+    note = {
+        "job": config.hydra.job.num,
+        "folder": os.path.relpath(folder, config.hydra.runtime.cwd),
+        "overrides": list(config.hydra.overrides.task),
+        "state": state,
+    }
+    with ledger.open("a") as file, _alone(file):
+        file.write(json.dumps(note) + "\n")  # in one piece, as other processes write here, too
+        file.flush()
+
+
+def note_lost(config: DictConfig, error: Exception) -> JobReturn:
+    """The result of a job that left none, which is noted unless it could tell itself how it ended."""
+    ledger, reason = ledger_of(config), one_line(error)
+    states = {note["job"]: note["state"] for note in read_ledger(ledger)}
+    state = states.get(config.hydra.job.num, STARTED)
+    if state == STARTED:
+        if was_stopped() and config.hydra.job.num not in states:
+            reason = NOT_STARTED
+        _write(ledger, config, f"{config.hydra.sweep.dir}/{config.hydra.sweep.subdir}", reason)
+        sys.stderr.write(f"job {config.hydra.job.num}: {reason}\n")
+    return _fail(JobReturn(status=JobStatus.FAILED), config, reason)
+
+
+def _fail(result: JobReturn, config: DictConfig, reason: str) -> JobReturn:
+    result.return_value = RuntimeError(reason)  # it can be pickled, whatever the error was
+    if config.hydra.sweeper._target_.endswith(".BasicSweeper"):
+        result.status = JobStatus.COMPLETED  # that sweeper would raise the first error and show no other
+    return result
+
+
+@contextlib.contextmanager
+def _alone(file: TextIO) -> Iterator[None]:
+    """Locks a file that processes of other machines write to as well, where the operating system can."""
+    if fcntl is not None:
+        with contextlib.suppress(OSError):  # not every file system can
+            fcntl.lockf(file, fcntl.LOCK_EX)  # closing gives it back
+    yield
 
 
 def one_line(error: Exception) -> str:
@@ -110,6 +149,16 @@ def one_line(error: Exception) -> str:
     """
     kind = "" if isinstance(error, JobStopped) else f"{type(error).__name__}: "
     return kind + str(error).partition("\n")[0]
+
+
+def ledger_of(config: DictConfig) -> Path:
+    """Where the notes of a sweep are."""
+    return Path(config.hydra.sweep.dir) / "jobs.jsonl"
+
+
+def was_started(config: DictConfig, job: int) -> bool:
+    """Whether this sweep began a job before."""
+    return any(note["job"] == job for note in read_ledger(ledger_of(config)))
 
 
 def read_ledger(ledger: Path) -> list[Note]:
@@ -147,6 +196,7 @@ class _Stop:
         self.in_job = False
         self.orphaned = False
         self._watching = False
+        self.elsewhere = False
 
     def pass_on(self, number: int, _: FrameType | None) -> None:
         """In the main process, which goes on waiting for its workers; a second signal ends all of them at once."""
@@ -197,13 +247,23 @@ def is_sweep() -> bool:
 
 def in_worker() -> bool:
     """Whether this process belongs to a parallel launcher."""
-    return multiprocessing.parent_process() is not None
+    return _stop.elsewhere or multiprocessing.parent_process() is not None
+
+
+def begin_elsewhere() -> None:
+    """This process does one job, as a launcher's worker."""
+    _stop.elsewhere = True
+
+
+def was_stopped() -> bool:
+    """Whether this sweep, or the job of this process, was asked to stop."""
+    return _stop.number is not None
 
 
 def refuse_if_stopped() -> None:
     """At the start of a job: raises :class:`JobStopped` if this worker was told to stop."""
     if in_worker() and _stop.number is not None:
-        raise JobStopped("not started, as the sweep was stopped")
+        raise JobStopped(NOT_STARTED)
 
 
 def end_stopped_job(exit_code: int) -> NoReturn:

@@ -17,7 +17,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from hdrqn_torchrl.cli import sweeps
+from hdrqn_torchrl.cli import launchers, sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 def main() -> None:
     """Runs with the arguments of the command line."""
     sys.argv[1:] = overrides_last(sys.argv[1:])
+    launchers.register()
     composed()
 
 
@@ -128,13 +129,11 @@ def in_words(run: Plan) -> Iterator[None]:
         raise
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    except (CheckpointError, NonFiniteError, WorkerError, WorkerLost) as error:
+    except (CheckpointError, NonFiniteError, WorkerError) as error:
         raise RunError(str(error)) from error
-    except OSError as error:
-        remedy = (
-            f"when that is fixed, `{command(run.folder, run.config.allowed_targets)}` goes on from the last checkpoint"
-        )
-        raise RunError(f"{error}; {remedy}.") from error
+    except (OSError, WorkerLost) as error:
+        goes_on = command(run.folder, run.config.allowed_targets)
+        raise RunError(f"{error}; when that is fixed, `{goes_on}` goes on from the last checkpoint.") from error
 
 
 def tell(sentence: str) -> None:

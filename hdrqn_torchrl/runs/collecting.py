@@ -92,6 +92,6 @@ def worker_part(
 def _place(settings: RunSettings, make: partial[Worker]) -> WorkerPlace:
     if settings.collector.kind == "processes":
         return ProcessWorkers(make)
-    from hdrqn_torchrl.runs.workers.ray_cluster import RayWorkers
+    from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
 
     return RayWorkers(make, workers=settings.collector.workers, address=settings.collector.address)

@@ -28,7 +28,7 @@ from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.state_checks import rules_of
 from hdrqn_torchrl.runs.window import Window, check_counters
-from hdrqn_torchrl.runs.workers import WorkersCollector
+from hdrqn_torchrl.runs.workers import WorkerLost, WorkersCollector
 
 
 class Trainer:
@@ -104,6 +104,7 @@ class Trainer:
 
         Raises:
             Interrupted: on SIGINT or SIGTERM, after saving. A second signal does not wait for that.
+            WorkerLost: if workers can't be had any more, after saving.
             NonFiniteError: before a NaN or an infinity reaches the weights.
             CheckpointError: if the training can't be saved.
         """
@@ -136,6 +137,11 @@ class Trainer:
                         break
             self.save()
         except Interrupted:
+            self.save()
+            raise
+        except WorkerLost:
+            assert isinstance(self.collector, WorkersCollector)
+            self.collector.give_up()
             self.save()
             raise
         except NonFiniteError as error:

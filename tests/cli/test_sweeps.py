@@ -7,13 +7,12 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
-from programs import CONF, ROOT, TINY, TINY_HDRQN, call
+from programs import CONF, ROOT, TINY, TINY_HDRQN, call, wait_until
 
 from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.runs.interruption import Interrupted
@@ -160,13 +159,6 @@ def test_a_stopped_serial_sweep_starts_no_more_jobs(tmp_path):
         process.kill()
     assert process.returncode == 130 and "1 of 1 started jobs" in told
     assert len(list(tmp_path.glob("sweep/*/checkpoints"))) == 1
-
-
-def wait_until(condition, seconds=120):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.1)
 
 
 class TestConfiguration:

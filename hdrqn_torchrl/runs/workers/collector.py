@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.runs.workers.handles import WorkerHandle, WorkerLost, WorkerPlace
+from hdrqn_torchrl.runs.workers.handles import PlaceLost, WorkerHandle, WorkerLost, WorkerPlace
 
 _MOST_FAILURES = 3
 
@@ -44,7 +44,8 @@ class WorkersCollector:
     Raises:
         ValueError: if an argument breaks its rule.
         WorkerError: while collecting, if a worker's own code fails.
-        WorkerLost: likewise, if a worker is lost three times in a row without a batch between.
+        WorkerLost: likewise, if a worker is lost three times in a row without a batch between, or all are and can't be
+            replaced (``PlaceLost``). After :meth:`give_up` the state can be saved all the same.
     """
 
     def __init__(
@@ -74,7 +75,7 @@ class WorkersCollector:
         self._next_ids = [0] * workers
         self._failures = [0] * workers  # since its last answer
         self._workers: list[WorkerHandle] = []
-        self._ordered = self._is_new = False
+        self._ordered = self._is_new = self._has_given_up = False
         self._version = 0  # updates of the weights that were sent last
         self._ready: TensorDictBase | None = None
         self.lost_workers = self.lost_episodes = 0
@@ -148,6 +149,8 @@ class WorkersCollector:
         while True:
             try:
                 return self._workers[index].send(method, *args)
+            except PlaceLost:
+                raise
             except WorkerLost as reason:
                 self._replace(index, reason)
                 args = self._afresh(method, args)
@@ -157,6 +160,8 @@ class WorkersCollector:
         while True:
             try:
                 answer = self._workers[index].receive(self.patience_seconds)
+            except PlaceLost:
+                raise
             except WorkerLost as reason:
                 self._replace(index, reason)
                 self._send(index, method, *self._afresh(method, args))
@@ -174,14 +179,24 @@ class WorkersCollector:
         if self._failures[index] >= _MOST_FAILURES:
             raise WorkerLost(
                 f"worker {index} {reason}, {_MOST_FAILURES} times in a row; look for what ends it (memory?), or raise "
-                "collector.patience_seconds."
+                "collector.patience_seconds"
             ) from reason
         print(f"worker {index} {reason}; it is replaced, and new episodes begin", file=sys.stderr, flush=True)
         self._workers[index].stop()
+        self._count_lost(index)
+        self._workers[index] = self.place.start(index, seed=self._seed_of(index))
+
+    def _count_lost(self, index: int) -> None:
         self.lost_workers += 1
         self.lost_episodes += self.worlds
         self._first_ids[index] = self._next_ids[index]
-        self._workers[index] = self.place.start(index, seed=self._seed_of(index))
+
+    def give_up(self) -> None:
+        """Counts all workers as lost. They are asked nothing any more, and others begin where this state is loaded."""
+        if not self._has_given_up:
+            self._has_given_up, self._ordered = True, False
+            for index in range(len(self._starts)):
+                self._count_lost(index)
 
     def metrics(self) -> dict[str, float]:
         """Workers and episodes lost so far; age of weights, in updates, in the batches since :meth:`clear`."""
@@ -201,7 +216,8 @@ class WorkersCollector:
         """All workers' states; what has been ordered is collected first, and is part of it."""
         if self._ordered:
             self._ready = self._gather()
-        self._start()
+        if not self._has_given_up:
+            self._start()
         return {
             "frames": self.frames,
             "ready": self._ready,
@@ -211,7 +227,7 @@ class WorkersCollector:
             "lost_workers": self.lost_workers,
             "lost_episodes": self.lost_episodes,
             "ages": list(self._ages),
-            "workers": self._ask_all("state_dict", [()] * len(self._workers)),
+            "workers": [None] * len(self._starts) if self._has_given_up else self._ask_all("state_dict"),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -224,15 +240,18 @@ class WorkersCollector:
         if stored is None or len(stored) != len(self._starts):
             found = "a collector without workers" if stored is None else f"{len(stored)} workers"
             raise ValueError(f"collector.workers must be as before, got {len(self._starts)} for the state of {found}.")
-        self._start()
-        self._ask_all("load_state_dict", [(each,) for each in stored])
+        if None not in stored:
+            self._start()
+            self._ask_all("load_state_dict", [(each,) for each in stored])
         self.frames, self._ready, self._ordered, self._is_new = state["frames"], state["ready"], False, True
         self._starts, self._first_ids = list(state["starts"]), list(state["first_ids"])
         self._next_ids = list(state["next_ids"])
         self.lost_workers, self.lost_episodes = state["lost_workers"], state["lost_episodes"]
         self._ages = list(state["ages"])
 
-    def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]]) -> list[Any]:
+    def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]] = ()) -> list[Any]:
+        """Their answers to a call with arguments for each of them."""
+        arguments = arguments or [()] * len(self._workers)
         for index, args in enumerate(arguments):
             self._send(index, method, *args)
         return [self._receive(index, method, *args) for index, args in enumerate(arguments)]

@@ -12,6 +12,10 @@ class WorkerLost(RuntimeError):
     """A worker has ended or does not answer; another one can take its place."""
 
 
+class PlaceLost(WorkerLost):
+    """Where workers run has gone, and with it all of them; none can take their place."""
+
+
 class WorkerError(RuntimeError):
     """A worker's own code has failed, with its traceback; another one would fail alike."""
 

@@ -1,34 +1,37 @@
-"""Workers as actors of a Ray cluster: one that runs, or one of this machine that begins and ends with the training."""
+"""This process in a Ray cluster: one that runs, or one of this machine that begins and ends with it."""
 
 from __future__ import annotations
 
-import os
-import sys
+import socket
+import time
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
-from torch import Tensor
-
-from hdrqn_torchrl.runs.workers.handles import WorkerError, WorkerLost
-from hdrqn_torchrl.runs.workers.worker import Worker
+from hdrqn_torchrl.runs.variables import search_path, variables
+from hdrqn_torchrl.runs.workers.handles import PlaceLost
 
 _LOOPBACK, _OWN_NODE = "127.0.0.1", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+_ENVIRONMENT = {
+    "RAY_gcs_rpc_server_reconnect_timeout_s": "600",  # after which Ray ends this process: an evaluation may take longer
+}
 _OWN_CLUSTER = {
     _OWN_NODE: "0",  # else Ray takes another address of this machine instead of the loopback one
     "RAY_AUTH_MODE": "disabled",  # else it writes a token to the home folder
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_kill_child_processes_on_worker_exit": "0",  # they end by themselves, the one that cleans up last
 }
+_PATIENCE_SECONDS = 10.0
+_CHECK_SECONDS = 0.5  # between two looks
 
 
-class RayWorkers:
-    """Starts workers in a Ray cluster, one core for each.
+class RayCluster:
+    """Joins a cluster, unless this process is in one.
 
     Args:
-        make: makes a worker when it is called with its number and seed: ``partial(Worker, make, steps=8)``.
-        workers: number of cores of a cluster that is started here.
+        cores: of a cluster that is started here.
         address: of a running cluster, or ``"auto"`` for the one of this machine; ``None``: one is started on 127.0.0.1,
             without dashboard.
+        show_output: of tasks and actors, on this terminal.
 
     Raises:
         ImportError: if Ray is missing.
@@ -36,31 +39,60 @@ class RayWorkers:
         RuntimeError: if a cluster started here would listen on other addresses than 127.0.0.1.
     """
 
-    def __init__(self, make: partial[Worker], *, workers: int, address: str | None = None) -> None:
-        ray = _ray()
+    def __init__(self, *, cores: int, address: str | None = None, show_output: bool = False) -> None:
+        ray = load_ray()
         self._began = not ray.is_initialized()
+        common = {"configure_logging": False, "log_to_driver": show_output}
         if self._began and address is None:
-            _start_on_loopback(ray, workers)
+            _start_on_loopback(ray, cores, common)
         elif self._began:
-            ray.init(address=address, configure_logging=False, log_to_driver=False)
-        self._actor = ray.remote(num_cpus=1, max_restarts=0)(Worker)
-        self.make = make
+            with variables(_ENVIRONMENT):
+                ray.init(address=address, **common)
+        self.address = ray.get_runtime_context().gcs_address
+        self._services = [self.address, _own_node(ray)]
+        self._seen = time.monotonic()
 
-    def start(self, index: int, *, seed: int) -> RayWorker:
-        """See :class:`WorkerPlace`."""
-        return RayWorker(self._actor.remote(*self.make.args, index, seed=seed, **self.make.keywords))
+    def check(self) -> None:
+        """Sees whether the cluster is still there; Ray itself would wait for ever, or end this process.
 
-    def share(self, weights: Mapping[str, Tensor]) -> Any:
-        """A reference to the weights in Ray's object store, where each machine gets them once."""
-        return _ray().put(dict(weights))
+        Raises:
+            PlaceLost: if it does not answer for ten seconds.
+        """
+        if time.monotonic() - self._seen < _CHECK_SECONDS:
+            return
+        until = time.monotonic() + _PATIENCE_SECONDS
+        while silent := [service for service in self._services if not _listens(service)]:
+            if time.monotonic() >= until:
+                raise PlaceLost(
+                    f"the Ray cluster at {self.address} must answer until the end, got nothing from "
+                    f"{', '.join(silent)} for {_PATIENCE_SECONDS:g} seconds; start it again"
+                )
+            time.sleep(1.0)
+        self._seen = time.monotonic()
 
     def close(self) -> None:
         """Ends the cluster, or the connection to it, if it began here."""
-        if self._began and _ray().is_initialized():
-            _ray().shutdown()
+        if self._began and load_ray().is_initialized():
+            load_ray().shutdown()
 
 
-def _start_on_loopback(ray: Any, workers: int) -> None:
+def load_ray() -> Any:
+    """The module, imported when it is first needed.
+
+    Raises:
+        ImportError: if it is missing.
+    """
+    try:
+        import ray
+        import ray.exceptions
+    except ImportError as error:
+        raise ImportError(
+            "collector=ray and sweep=ray need Ray; install it: pip install 'hdrqn_torchrl[ray]'."
+        ) from error
+    return ray
+
+
+def _start_on_loopback(ray: Any, cores: int, common: Mapping[str, bool]) -> None:
     """A cluster of this machine that nobody else can reach.
 
     ``ray.init`` would replace 127.0.0.1 by another address of this machine, unless a variable of the environment was
@@ -69,58 +101,30 @@ def _start_on_loopback(ray: Any, workers: int) -> None:
     from ray._private import ray_constants
 
     before, ray_constants.ENABLE_RAY_CLUSTER = ray_constants.ENABLE_RAY_CLUSTER, False
-    environment = dict(os.environ)
-    os.environ.update(_OWN_CLUSTER, PYTHONPATH=os.pathsep.join(sys.path))  # workers find what this process finds
     try:
-        ray.init(
-            _node_ip_address=_LOOPBACK, num_cpus=workers, include_dashboard=False, configure_logging=False,
-            log_to_driver=False,
-        )  # fmt: skip
+        with variables(_ENVIRONMENT | _OWN_CLUSTER | search_path()):
+            ray.init(_node_ip_address=_LOOPBACK, num_cpus=cores, include_dashboard=False, **common)
     finally:
         ray_constants.ENABLE_RAY_CLUSTER = before
-        os.environ.clear()
-        os.environ.update(environment)
     if (found := {node["NodeManagerAddress"] for node in ray.nodes()}) != {_LOOPBACK}:
         ray.shutdown()
         raise RuntimeError(
             f"Ray must listen on {_LOOPBACK} only, got {sorted(found)} with Ray {ray.__version__}; set {_OWN_NODE}=0 "
-            "before Python starts, or start a cluster and give collector.address."
+            "before Python starts, or start a cluster and give its address."
         )
 
 
-class RayWorker:
-    """A worker in a Ray actor."""
-
-    def __init__(self, actor: Any) -> None:
-        self.actor, self._answer = actor, None
-
-    def send(self, method: str, *args: Any) -> None:
-        """See :class:`WorkerHandle`."""
-        self._answer = getattr(self.actor, method).remote(*args)
-
-    def receive(self, seconds: float) -> Any:
-        """See :class:`WorkerHandle`."""
-        errors = _ray().exceptions
-        try:
-            return _ray().get(self._answer, timeout=seconds)
-        except errors.GetTimeoutError as error:
-            raise WorkerLost(f"did not answer for {seconds:g} seconds") from error
-        except errors.RayTaskError as error:
-            raise WorkerError(str(error)) from error
-        except errors.RayError as error:
-            if "creation task" in str(error):  # it never came to be
-                raise WorkerError(str(error)) from error
-            raise WorkerLost(f"ended ({type(error).__name__})") from error
-
-    def stop(self) -> None:
-        """See :class:`WorkerHandle`."""
-        _ray().kill(self.actor)
+def _own_node(ray: Any) -> str:
+    """Where the Ray process of this machine listens."""
+    here = ray.get_runtime_context().get_node_id()
+    node = next(each for each in ray.nodes() if each["NodeID"] == here)
+    return f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}"
 
 
-def _ray() -> Any:
+def _listens(service: str) -> bool:
+    host, _, port = service.rpartition(":")
     try:
-        import ray
-        import ray.exceptions
-    except ImportError as error:
-        raise ImportError("collector=ray needs Ray; install it: pip install 'hdrqn_torchrl[ray]'.") from error
-    return ray
+        socket.create_connection((host.strip("[]"), int(port)), timeout=2.0).close()
+    except OSError:
+        return False
+    return True

@@ -32,7 +32,7 @@ def listeners() -> set[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def cluster():
-    from hdrqn_torchrl.runs.workers.ray_cluster import RayWorkers
+    from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
 
     before = listeners()
     place = RayWorkers(partial(Worker, partial(make_part, "v3", 2), steps=8, all_worlds=WORLDS, threads=1), workers=2)
@@ -70,7 +70,7 @@ def test_a_killed_worker_is_replaced_and_only_loopback_listens(cluster):
 
 
 def test_an_error_in_a_worker_is_told(cluster):
-    from hdrqn_torchrl.runs.workers.ray_cluster import RayWorkers
+    from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
 
     place = RayWorkers(partial(Worker, make_failing_part, steps=8), workers=1)
     with pytest.raises(WorkerError, match="no such world"):
