@@ -4,8 +4,8 @@
     python check.py env=mine --config-dir my_conf allowed_targets=[my_package.MyEnv]
     python check.py env._target_=my_package.MyEnv allowed_targets=[my_package.MyEnv]
 
-Takes the arguments of a training, of which it uses seed and env. Four worlds are stepped with random actions. The exit
-code is 1 if something is wrong that prevents training, else 0. docs/own_tasks.md explains the contract.
+Takes the arguments of a training, of which it uses seed, env and network. Four worlds are stepped with random actions.
+The exit code is 1 if something is wrong that prevents training, else 0. docs/own_tasks.md explains the contract.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from omegaconf import open_dict
 from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, resolved
 from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.building import build_env
+from hdrqn_torchrl.runs.building import build, build_env
 from hdrqn_torchrl.runs.commands import as_called, command_of
 from hdrqn_torchrl.runs.settings import RunSettings, check
 
@@ -75,4 +75,5 @@ def check_settings(settings: RunSettings) -> list[str]:
 
     changes = {"seed": settings.seed, "device": "cpu", "num_envs": WORLDS}
     env = build_env(settings, changes, settings.allowed_targets)
-    return [str(finding) for finding in check_task(env)]
+    network = build(settings.network, place="network", allowed=settings.allowed_targets)
+    return [str(finding) for finding in check_task(env, network_problem=network.observation_problem)]

@@ -18,6 +18,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.check_choices import check_masks, check_observation, random_actions
 from hdrqn_torchrl.envs.findings import Finding, missing, wrong
+from hdrqn_torchrl.envs.observations import ProblemOf
 from hdrqn_torchrl.envs.specs import check_is_environment
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
 from hdrqn_torchrl.envs.task import Task, task_of
@@ -27,7 +28,9 @@ _TOLERANCE = 1e-4  # of sums of rewards
 _GO_ON = 20  # steps after a restored state
 
 
-def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding]:
+def check_task(
+    env: EnvBase, *, steps: int = 300, seed: int = 0, network_problem: ProblemOf | None = None
+) -> list[Finding]:
     """Steps an environment with random actions, from two seeds, and compares it with the contract for tasks.
 
     What random actions do not reach is not checked: the end of an episode, say, or a subgoal.
@@ -36,6 +39,8 @@ def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding
         env: with batch size ``[N]``, without an agent's own transforms; it is reset, so its worlds are lost.
         steps: of each rollout.
         seed: the first one.
+        network_problem: ``observation_problem`` of the network that is to read the observation: what it can't read is
+            wrong. ``None``: what built-in networks can't read is missing, as others may read it.
 
     Returns:
         What is wrong first, then what is missing; empty if nothing is.
@@ -52,7 +57,7 @@ def check_task(env: EnvBase, *, steps: int = 300, seed: int = 0) -> list[Finding
     if steps < 1:
         raise ValueError(f"steps must be >= 1, got {steps}; 300 show most faults.")
     task = task_of(env)
-    found = [*_entries(env, task), *_statement(env, task)]
+    found = [*_entries(env, task), *check_observation(env, network_problem), *_statement(env, task)]
     if not any(finding.severity == "wrong" for finding in found):  # else it can't be stepped as agents do
         with own_random_numbers(seed):
             found += _behaviour(env, task, steps, seed)
@@ -98,7 +103,6 @@ def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
     for each in task.subgoals:
         if each.keys.attained not in specs:
             yield wrong(f"{each.keys.attained!r} is missing, though its subgoals are stated", "no agent pursues them")
-    yield from check_observation(env)
     yield from _optional(specs, task)
 
 

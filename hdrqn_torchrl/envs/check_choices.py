@@ -10,21 +10,24 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.findings import Finding, missing, wrong
-from hdrqn_torchrl.envs.observations import code_sizes, observation_kind, observation_problem
+from hdrqn_torchrl.envs.observations import ProblemOf, code_sizes, observation_kind, observation_problem
 
 _BYTE = 256
 
 
-def check_observation(env: EnvBase) -> Iterator[Finding]:
-    """Whether built-in networks can read the observation, and whether its codes are stored as bytes."""
+def check_observation(env: EnvBase, network_problem: ProblemOf | None = None) -> Iterator[Finding]:
+    """Whether a network, or the built-in ones, can read the observation, and whether its codes are stored as bytes."""
     spec = env.observation_spec.get(keys.OBSERVATION, None)
     if spec is None or not hasattr(spec, "dtype"):
         return
     shape = spec.shape[len(env.batch_size) :]
-    if (problem := observation_problem(spec, shape)) is not None:
+    if (problem := (network_problem or observation_problem)(spec, shape)) is not None:
         rule, remedy = problem
         text = f"{keys.OBSERVATION!r} is not {rule}, but {spec.dtype} {list(spec.shape)}; {remedy}"
-        yield missing(text, "built-in networks can't read it")
+        if network_problem is None:
+            yield missing(text, "built-in networks can't read it")
+        else:
+            yield wrong(text, "no agent can be made for it with this network")
     elif observation_kind(spec, shape) in ("cells", "codes"):
         largest, size = max(code_sizes(spec, shape)), spec.dtype.itemsize
         if largest <= _BYTE and size > 1:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, OneHot, TensorSpec
 
 ObservationKind = Literal["cells", "codes", "image", "vector"]
+ProblemOf = Callable[[TensorSpec, Sequence[int]], tuple[str, str] | None]
+"""Takes an observation's spec and its shape without the batch dimensions; see :func:`observation_problem`."""
 
 LARGEST_FLOAT = 10.0
 """Images in float32 with bounds above this are not taken to be scaled to about 1."""
@@ -89,15 +91,16 @@ def code_sizes(spec: TensorSpec, shape: Sequence[int]) -> tuple[int, ...]:
     if isinstance(spec, MultiCategorical):
         return tuple(spec.nvec.expand(spec.shape).reshape(-1, entries)[0].tolist())
     if isinstance(spec, Bounded):
-        return tuple((spec.space.high.expand(spec.shape).reshape(-1, entries)[0].long() + 1).tolist())
+        highest = spec.space.high.expand(spec.shape).reshape(-1, entries)[0].tolist()
+        return tuple(int(each) + 1 for each in highest)  # numbers of Python, which don't overflow
     return (int(spec.space.n),) * entries
 
 
 def _counts(spec: Bounded) -> bool:
     """Whether bounded integers ``[*, D]`` can be taken for codes."""
-    low, high = spec.space.low, spec.space.high
-    known = bool((low == 0).all()) and bool((high < _MOST_CODES).all())
-    return known and sum(code_sizes(spec, spec.shape[-1:])) <= _MOST_CODES
+    if not bool((spec.space.low == 0).all()):
+        return False
+    return sum(code_sizes(spec, spec.shape[-1:])) <= _MOST_CODES
 
 
 def _is_image(spec: TensorSpec, shape: Sequence[int]) -> bool:

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 from torchrl.data import TensorSpec
 
-from hdrqn_torchrl.envs.observations import code_sizes, observation_kind, observation_problem
+from hdrqn_torchrl.envs.observations import ProblemOf, code_sizes, observation_kind, observation_problem
 from hdrqn_torchrl.modules.code_features import CodeFeatures
 from hdrqn_torchrl.modules.decoders import CellDecoder, CodeDecoder, Decoder, ImageDecoder, VectorDecoder
 from hdrqn_torchrl.modules.features import (
@@ -45,7 +45,7 @@ class Architecture:
     gate_features: bool = False
     observation_features: Callable[[TensorSpec], Features]
     vector_features: Callable[[int], Features]
-    observation_problem: Callable[[TensorSpec, Sequence[int]], tuple[str, str] | None] = lambda spec, shape: None
+    observation_problem: ProblemOf = lambda spec, shape: None
 
     def __post_init__(self) -> None:
         check_size("hidden_size", self.hidden_size, "64, or the paper's 256")

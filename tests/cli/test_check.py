@@ -1,8 +1,11 @@
 """check.py: the contract for tasks on the command line."""
 
 import pytest
+import torch
 from helpers import small_env
+from torchrl.data import Unbounded
 from torchrl.envs import TransformedEnv
+from user_envs import Corridor
 
 from hdrqn_torchrl.cli import check
 from hdrqn_torchrl.transforms import Critic
@@ -37,6 +40,13 @@ def test_an_environment_of_a_users_configuration_folder_is_checked_wherever_the_
 def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
     monkeypatch.setattr(check, "check_settings", lambda settings: ["wrong: 'reward' is missing (no agent)"])
     assert run("env=gridworld") == (1, "wrong: 'reward' is missing (no agent)\n")
+
+
+def test_an_observation_that_the_network_can_not_read_gives_exit_code_1(run, monkeypatch):
+    env = Corridor(4, odd={"observation": Unbounded((4, 3), dtype=torch.float64)})
+    monkeypatch.setattr("hdrqn_torchrl.cli.check.build_env", lambda *_: env)
+    code, told = run("env=gridworld")
+    assert code == 1 and told.startswith("wrong: 'observation' is not a square of cell codes")
 
 
 def test_an_error_of_a_part_of_the_environment_is_told_without_a_traceback(run, monkeypatch):
