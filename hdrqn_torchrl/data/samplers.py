@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl.data import SliceSampler, Storage
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data.slices import episode_starts, padded_slices
+from hdrqn_torchrl.data.slices import episode_starts, padded_slices, steps_left, steps_passed
 
 
 class StepSliceSampler(SliceSampler):
@@ -67,6 +67,24 @@ class StepSliceSampler(SliceSampler):
     def can_sample(self, storage: Storage) -> bool:
         """Whether there is a slice to draw from a storage that is not empty."""
         return len(self._episodes(storage).first) > 0
+
+    def weights(self, storage: Storage) -> tuple[Tensor, Tensor | None]:
+        """How likely each stored step starts a slice, and how many steps of its episode are left from there on.
+
+        The same as :meth:`sample` draws by, in shapes that do not depend on what is stored: ``[rows, N]``.
+        """
+        left, starts, _ = self._steps(storage)
+        return starts.double(), left
+
+    def _steps(self, storage: Storage) -> tuple[Tensor, Tensor, Tensor]:
+        """Of each stored step: steps left, whether a slice can start, whether the last stored one counts as a start."""
+        rows, newest = (len(storage[:]), -1), storage._last_cursor_index  # type: ignore[attr-defined]
+        episode = storage[:].get(self.traj_key).view(rows)
+        known = torch.ones_like(episode, dtype=torch.bool)
+        if self.terminated_key is not None:
+            known = storage[:].get(self.terminated_key).view(rows)
+        left, counts = steps_left(episode, known, newest)
+        return left, counts | (left > 1), counts
 
     def _episodes(self, storage: Storage) -> _Episodes:
         """The stored episodes in which a slice can start."""
@@ -131,6 +149,13 @@ class EpisodeSliceSampler(StepSliceSampler):
         start[:, 0] += passed
         return padded_slices(start, lengths[episode] - passed, length, rows=storage.shape[0])
 
+    def weights(self, storage: Storage) -> tuple[Tensor, Tensor | None]:
+        """As those of :class:`StepSliceSampler`; all places of an episode together have the weight 1."""
+        left, starts, counts = self._steps(storage)
+        passed = steps_passed(storage[:].get(self.traj_key).view(left.shape), storage._last_cursor_index)  # type: ignore[attr-defined]
+        places = (passed + left - (~counts).long() - (self.slice_len - self.lookahead)).clamp(min=0) + 1
+        return torch.where(starts & (passed < places), 1.0 / places.double(), 0.0), left
+
 
 class WholeEpisodeSampler(StepSliceSampler):
     """Slices that start where a random episode starts, padded after its end.
@@ -163,6 +188,11 @@ class WholeEpisodeSampler(StepSliceSampler):
             raise RuntimeError("no stored episode has its first step; raise capacity above the length of an episode.")
         chosen = torch.randint(len(first), (count,), device=first.device, generator=self._rng)
         return padded_slices(first[chosen], lengths[chosen], length, rows=storage.shape[0])
+
+    def weights(self, storage: Storage) -> tuple[Tensor, Tensor | None]:
+        """As those of :class:`StepSliceSampler`."""
+        left, starts, _ = self._steps(storage)
+        return (starts & storage[:].get(self.first_key).view(left.shape)).double(), left
 
     def _find(self, storage: Storage) -> _Episodes:
         """Those whose first step is stored."""
@@ -209,6 +239,10 @@ class EpisodeStartSampler(SliceSampler):
         times = time[chosen].unsqueeze(-1) + torch.arange(length, device=time.device)
         return ((times % storage.shape[0]).flatten(), environment[chosen].repeat_interleave(length)), {}
 
+    def weights(self, storage: Storage) -> tuple[Tensor, Tensor | None]:
+        """As those of :class:`StepSliceSampler`; no slice ends early."""
+        return self._are_starts(storage, self.slice_len).double(), None
+
     def can_sample(self, storage: Storage) -> bool:
         """Whether enough steps follow a start of an episode in a storage that is not empty."""
         return len(self._starts(storage)[0]) > 0
@@ -222,7 +256,9 @@ class EpisodeStartSampler(SliceSampler):
         return self._cache[contents]
 
     def _find_starts(self, storage: Storage, length: int) -> tuple[Tensor, Tensor]:
+        return self._are_starts(storage, length).nonzero(as_tuple=True)  # type: ignore[return-value]
+
+    def _are_starts(self, storage: Storage, length: int) -> Tensor:
         steps = storage[:].select(self.first_key, self.traj_key, self.done_key)
         init, episode, done = (steps.get(key) for key in (self.first_key, self.traj_key, self.done_key))
-        starts = episode_starts(init.squeeze(-1), episode, done.squeeze(-1), storage._last_cursor_index, length)
-        return starts.nonzero(as_tuple=True)  # type: ignore[return-value]
+        return episode_starts(init.squeeze(-1), episode, done.squeeze(-1), storage._last_cursor_index, length)

@@ -70,6 +70,30 @@ def steps_left(episode: Tensor, done: Tensor, newest: int) -> tuple[Tensor, Tens
     return (last - time + 1).roll(-age, 0), done.gather(0, last).roll(-age, 0)
 
 
+def steps_passed(episode: Tensor, newest: int) -> Tensor:
+    """How many stored steps of its episode each step of a ring comes after.
+
+    Args:
+        episode: number of the episode, ``[rows, N]``.
+        newest: row that was written last.
+
+    Returns:
+        ``[rows, N]``.
+
+    Examples:
+        >>> steps_passed(torch.tensor([[7], [7], [7], [5], [7]]), newest=2).flatten().tolist()
+        [1, 2, 3, 0, 0]
+    """
+    rows = len(episode)
+    age = rows - 1 - newest
+    episode = episode.roll(age, 0)  # oldest first
+    time = torch.arange(rows, device=episode.device).unsqueeze(-1)
+    is_first = episode != episode.roll(1, 0)
+    is_first[0] = True
+    first = torch.where(is_first, time, 0).cummax(0).values
+    return (time - first).roll(-age, 0)
+
+
 def padded_slices(
     start: Tensor, left: Tensor, length: int, *, rows: int
 ) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:

@@ -76,7 +76,7 @@ class Captured:
 
     def __init__(
         self,
-        function: Callable[[TensorDictBase, Any], dict[str, Tensor]],
+        function: Callable[[TensorDictBase | None, Any], dict[str, Tensor]],
         *,
         warm_ups: int = 3,
         recording: Callable[[], Recording] = CudaRecording,
@@ -89,24 +89,29 @@ class Captured:
         self._inputs: TensorDictBase | None = None
         self._pieces: dict[Hashable, Replayed] = {}
 
-    def __call__(self, sample: TensorDictBase, variant: Hashable = None) -> dict[str, Tensor]:
+    def __call__(self, sample: TensorDictBase | None, variant: Hashable = None) -> dict[str, Tensor]:
         """Does the work for ``sample``.
 
         Args:
-            sample: the minibatch.
+            sample: the minibatch; ``None``: the function draws it.
             variant: what the host has decided: there is one recording for each.
 
         Returns:
             The function's results, which later calls leave alone.
         """
+        piece = sample is None, variant
+        if piece not in self._pieces:
+            self._pieces[piece] = Replayed(self._make_recording(), self._warm_ups)
+        inputs = None if sample is None else self._hold(sample)
+        return self._pieces[piece](lambda: self._function(inputs, variant))
+
+    def _hold(self, sample: TensorDictBase) -> TensorDictBase:
+        """The minibatch in the memory that recordings read."""
         if self._inputs is None:
             self._inputs = sample.clone()
         else:
             _copy(sample, self._inputs)
-        if variant not in self._pieces:
-            self._pieces[variant] = Replayed(self._make_recording(), self._warm_ups)
-        inputs = self._inputs
-        return self._pieces[variant](lambda: self._function(inputs, variant))
+        return self._inputs
 
 
 class Replayed:

@@ -13,9 +13,10 @@ from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 
 from hdrqn_torchrl.data import Continuity, sample_sequences
+from hdrqn_torchrl.data.device_draws import DeviceDraws
 from hdrqn_torchrl.learning.captured import Captured, wants_capture
 from hdrqn_torchrl.learning.finite import FiniteGuard
-from hdrqn_torchrl.learning.memory import Extract, make_longer_episodes, make_memory
+from hdrqn_torchrl.learning.memory import Extract, make_longer_episodes, make_memory, warn_incomplete, warn_longer
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision
 from hdrqn_torchrl.learning.settings import LearnerSettings
@@ -92,8 +93,12 @@ class Learner:
             guard=self.guard,
             max_grad_norm=settings.max_grad_norm,
         )
-        self._captured = Captured(lambda sample, ahead: self._step(sample, self.precision, ahead)) if captures else None
+        self._captured = Captured(self._gradient_step) if captures else None
         self._sequence_len = (settings.slice_len or 0) + getattr(loss, "lookahead", 0)
+        draws = captures and refresh is None and settings.priority_exponent is None
+        self._draws = (
+            DeviceDraws(self.buffer, sequences=settings.batch_size, length=self._sequence_len) if draws else None
+        )
         self._longer = make_longer_episodes(settings, loss, num_envs=num_envs, episode_len=episode_len)
         self._continuity = Continuity()
         self._drawn: list[TensorDictBase] = []
@@ -141,12 +146,7 @@ class Learner:
         """Warns once that an episode has transitions that no sequence from its start will ever show."""
         if self._longer is not None and self._longer.seen(transitions):
             self._longer = None
-            warnings.warn(
-                f"slice_len should cover an episode with sampling={self.settings.sampling!r}, got "
-                f"{self.settings.slice_len} where one has more transitions; the later ones are never learned from: "
-                "raise slice_len, or use sampling='steps' with stored_state=True.",
-                stacklevel=3,
-            )
+            warn_longer(self.settings)
 
     @property
     def _frames_owed(self) -> float:
@@ -159,12 +159,7 @@ class Learner:
             return True
         if self.buffer.is_full() and not self._has_warned:
             self._has_warned = True
-            warnings.warn(
-                f"capacity should be so large that a sequence of {self._sequence_len} transitions that begins where an "
-                f"episode does is always stored, got {self.settings.capacity}; nothing is learned while there is none: "
-                "raise it, use a smaller slice_len, or stored_state=True with sampling='steps'.",
-                stacklevel=3,
-            )
+            warn_incomplete(self.settings, self._sequence_len)
         return False
 
     def updates_due(self) -> int:
@@ -173,8 +168,8 @@ class Learner:
         return owed if owed > 0 and self._can_draw() else 0
 
     def learn(self) -> dict[str, Tensor]:
-        """Draws one minibatch and learns from it: :meth:`update` of :meth:`sample`."""
-        return self.update(self.sample())
+        """Draws one minibatch and learns from it: :meth:`update` of :meth:`sample`, or both captured together."""
+        return self.update(self.sample() if self._draws is None else None)
 
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
@@ -184,8 +179,11 @@ class Learner:
         sample = self._drawn.pop()
         return sample if self.refresh is None else self.refresh(sample)
 
-    def update(self, sample: TensorDictBase) -> dict[str, Tensor]:
+    def update(self, sample: TensorDictBase | None) -> dict[str, Tensor]:
         """One gradient step on ``sample`` and one soft update of the target network.
+
+        Args:
+            sample: the minibatch; ``None``, where updates are captured: a new one, drawn by the device.
 
         Returns:
             Scalars without gradient: ``loss``, ``td_error``, ``q_value``, ``target``, ``trained_steps`` and, if
@@ -196,15 +194,24 @@ class Learner:
                 :meth:`check_finite` raises it.
         """
         self.guard.begin(f"update {self.updates + 1}, frame {self.frames}")
+        if self._draws is not None:
+            self._draws.refresh()
         if self._captured is None:
-            report = self._step(sample, self.precision)
+            report = self._gradient_step(sample, None)
         else:
-            report = self._captured(sample, self._step.draw_ahead(sample))
+            report = self._captured(sample, self._step.draw_ahead(self._sequence_len))
         priority = report.pop("priority", None)
         self.updates += 1
-        if self.settings.priority_exponent is not None:
+        if self.settings.priority_exponent is not None and sample is not None:
             self.buffer.update_priority(sample["index"][:, 0], priority)
         return report
+
+    def _gradient_step(self, sample: TensorDictBase | None, ahead: int | None) -> dict[str, Tensor]:
+        """What is captured: the update, and the draw if there is no ``sample``."""
+        if sample is None:
+            assert self._draws is not None, "only where updates are captured the device draws"
+            sample = self._draws.draw()
+        return self._step(sample, self.precision, ahead)
 
     def copy_to_target(self) -> None:
         """Makes the target network the same as the one that is trained."""
@@ -248,6 +255,8 @@ class Learner:
         A memory of earlier versions, which kept each observation twice, is left out, with a warning: the memory
         then begins empty and is warmed up again.
         """
+        if self._captured is not None:
+            self._captured.reset()
         if holds_inputs_twice(state["buffer"], self.loss.in_keys):
             warnings.warn(
                 "the stored replay memory is of an earlier version, which kept each observation twice; it begins empty "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, Protocol
 
 import torch
@@ -68,6 +69,26 @@ def make_longer_episodes(
         return None
     done_key, terminated_key = _ends(loss, rows=num_envs is None)
     return LongerEpisodes(settings.slice_len, done_key=done_key, terminated_key=terminated_key or keys.TERMINATED)
+
+
+def warn_longer(settings: LearnerSettings) -> None:
+    """An episode has transitions that no sequence from its start will ever show."""
+    warnings.warn(
+        f"slice_len should cover an episode with sampling={settings.sampling!r}, got {settings.slice_len} where one "
+        "has more transitions; the later ones are never learned from: raise slice_len, or use sampling='steps' with "
+        "stored_state=True.",
+        stacklevel=5,
+    )
+
+
+def warn_incomplete(settings: LearnerSettings, length: int) -> None:
+    """A memory is full, and holds no sequence of ``length`` transitions that could be drawn."""
+    warnings.warn(
+        f"capacity should be so large that a sequence of {length} transitions that begins where an episode does is "
+        f"always stored, got {settings.capacity}; nothing is learned while there is none: raise it, use a smaller "
+        "slice_len, or stored_state=True with sampling='steps'.",
+        stacklevel=4,
+    )
 
 
 def _ends(loss: LossModule, *, rows: bool) -> tuple[NestedKey, NestedKey | None]:

@@ -45,10 +45,14 @@ class UpdateStep:
         self.loss, self.parameters, self.optimizer = loss, parameters, optimizer
         self.target_updater, self.guard, self.max_grad_norm = target_updater, guard, max_grad_norm
 
-    def draw_ahead(self, sample: TensorDictBase) -> int | None:
-        """What the host decides about an update: how many steps ahead the loss predicts, if it does."""
+    def draw_ahead(self, steps: int) -> int | None:
+        """What the host decides about an update: how many steps ahead the loss predicts, if it does.
+
+        Args:
+            steps: T, of the minibatch.
+        """
         draw = getattr(self.loss, "draw_ahead", None)
-        return None if draw is None else draw(sample.shape[1])
+        return None if draw is None else draw(steps)
 
     def __call__(self, sample: TensorDictBase, precision: Precision, ahead: int | None = None) -> dict[str, Tensor]:
         """One gradient step on ``sample`` and one soft update of the target network.
