@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hdrqn_torchrl.runs.workers import Worker, WorkerLost
+from hdrqn_torchrl.runs.workers import PlaceLost, Worker, WorkerLost
 
 
 class HereWorkers:
@@ -13,6 +13,7 @@ class HereWorkers:
     def __init__(self, make):
         self.make, self.started, self.closed = make, [], 0
         self.loses = []  # numbers of those that are lost at their next answer
+        self.has_gone = False
 
     def start(self, index, *, seed):
         self.started.append((index, seed))
@@ -36,6 +37,8 @@ class HereWorker:
         self.call = method, args
 
     def receive(self, seconds):
+        if self.place.has_gone:
+            raise PlaceLost("the place must answer, got nothing")
         if self.index in self.place.loses:
             self.place.loses.remove(self.index)
             raise WorkerLost("was lost")

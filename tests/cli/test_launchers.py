@@ -214,6 +214,6 @@ def test_ctrl_c_saves_the_jobs_and_leaves_no_process_and_no_file(tmp_path, kind)
 
 def processes():
     """Those of Ray, of submitit, and of trainings, by number and command."""
-    found = subprocess.run(["ps", "-eo", "pid=,args="], capture_output=True, text=True, check=True).stdout
+    found = subprocess.run(["ps", "-ewwo", "pid=,args="], capture_output=True, text=True, check=True).stdout
     marks = ("raylet", "gcs_server", "ray::", "submitit", "hydra.sweep.dir=sweep")
     return {line for line in found.splitlines() if any(mark in line for mark in marks)}

@@ -8,11 +8,12 @@ import pytest
 import torch
 from stamped_worlds import AGENTS, EPISODE, StampedWorlds, make_grid_part, make_part
 from workers_here import HereWorkers
+from world_logs import check_options, check_sequences
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.runs.collectors import ResumableCollector
-from hdrqn_torchrl.runs.workers import WorkerLost, WorkersCollector
+from hdrqn_torchrl.runs.workers import PlaceLost, WorkerLost, WorkersCollector
 
 WORLDS, STEPS = 8, 8
 
@@ -47,51 +48,6 @@ def learned(algorithm, collector, number, *, lost=None):
         if lost is not None:
             lost(index)
     return seen
-
-
-def check_sequences(algorithm) -> int:
-    """Every sequence of steps shows one world, one episode, one step after the other. Returns their number."""
-    found = 0
-    for name, learner in algorithm.learners.items():
-        if name == "meta":
-            continue
-        for _ in range(40):
-            sample = learner.sample()
-            shown = sample["observation"]
-            real = sample.get(("collector", "mask"), torch.ones(sample.shape, dtype=torch.bool))[:, 1:]
-            assert ((shown[:, 1:, :3] == shown[:, :-1, :3]).all(-1) | ~real).all()
-            assert ((shown[:, 1:, 3] == shown[:, :-1, 3] + 1) | ~real).all()
-            found += len(sample)
-    return found
-
-
-def options_by_hand(batches) -> list[tuple]:
-    """(episode, subgoal, steps) of every option, row by row from what the worlds themselves showed."""
-    whole, found = torch.cat(batches, 1), []
-    for row in whole.unbind(0):
-        length, last = 0, None
-        for step in row.unbind(0):
-            stamp = tuple(step["observation"][:3].tolist())
-            starts = bool(step["option_init"])
-            assert starts or stamp == last, "an option goes on in another episode"
-            length, last = (1 if starts else length + 1), stamp
-            if bool(step["next", "option_done"]):
-                found.append((int(step["collector", "traj_ids"]), int(step["next", "active_subgoal"]), length))
-    return found
-
-
-def check_options(algorithm, batches) -> int:
-    """The option memory holds those of the worlds' own logs, and no other one. Returns their number."""
-    truth = options_by_hand(batches)
-    stored = algorithm.learners["meta"].buffer[:]
-    rows = zip(
-        stored["collector", "traj_ids"].flatten().tolist(), stored["subgoal"].flatten().tolist(),
-        stored["next", "option_steps"].flatten().tolist(), strict=True,
-    )  # fmt: skip
-    real = [row for row in rows if row[2] > 0]  # others are final rows
-    for row in set(real):
-        assert real.count(row) <= truth.count(row), row
-    return len(real)
 
 
 @pytest.mark.parametrize("agent", ["v2", "v3"])
@@ -243,3 +199,31 @@ def test_a_state_of_another_number_of_workers_is_refused():
     )  # fmt: skip
     with pytest.raises(ValueError, match="collector must be one with 2 workers, as before, got local"):
         local.load_state_dict(state)
+
+
+@pytest.mark.parametrize("sync", [True, False])
+def test_when_the_place_has_gone_none_is_replaced_and_new_episodes_begin_where_its_state_is_loaded(sync):
+    algorithm, collector = stamped("v3", 2, sync=sync)
+    before = learned(algorithm, collector, 4)
+    collector.place.has_gone = True
+    with pytest.raises(PlaceLost, match="the place must answer"):
+        rounds(collector, 3 if sync else 2)
+    assert len(collector.place.started) == 2
+    collector.give_up()
+    state = collector.state_dict()
+    assert state["workers"] == [None, None]
+    assert collector.metrics()["collector/lost_workers"] == 2
+    _, again = stamped("v3", 2, sync=sync)
+    again.load_state_dict(state)
+    later = rounds(again, 3)
+    assert again.frames == collector.frames + sum(batch.numel() for batch in later)
+    assert not stamps(before) & stamps(later)
+    assert not numbers_of(before) & numbers_of(later)
+
+
+def stamps(batches):
+    return {tuple(stamp) for batch in batches for stamp in batch["observation"][..., :3].flatten(0, 1).tolist()}
+
+
+def numbers_of(batches):
+    return {number for batch in batches for number in batch["collector", "traj_ids"].flatten().tolist()}

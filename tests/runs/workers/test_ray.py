@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
+from programs import ROOT, TINY, TINY_HDRQN, wait_until
 from stamped_worlds import AGENTS, StampedWorlds, make_failing_part, make_part
 
-from hdrqn_torchrl.runs.workers import Worker, WorkerError, WorkersCollector
+from hdrqn_torchrl.runs.workers import PlaceLost, Worker, WorkerError, WorkersCollector
 
 if find_spec("ray") is None:
     pytest.skip("Ray is not installed", allow_module_level=True)
@@ -75,3 +78,47 @@ def test_an_error_in_a_worker_is_told(cluster):
     place = RayWorkers(partial(Worker, make_failing_part, steps=8), workers=1)
     with pytest.raises(WorkerError, match="no such world"):
         next(iter(collector_at(place)))
+
+
+def test_a_cluster_that_has_gone_ends_the_collection_and_the_state_can_be_saved(cluster):
+    """The last test of this cluster."""
+    import ray
+
+    collector = collector_at(cluster[0])
+    batches = iter(collector)
+    next(batches)
+    (server,) = ray._private.worker._global_node.all_processes["gcs_server"]
+    server.process.kill()
+    with pytest.raises(PlaceLost, match=r"the Ray cluster at 127\.0\.0\.1:\d+ must answer until the end, got nothing"):
+        for _ in range(10**6):
+            next(batches)
+    collector.give_up()
+    assert collector.state_dict()["workers"] == [None, None]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", ["gcs_server", "raylet/raylet"])
+def test_a_training_whose_cluster_goes_saves_all_that_was_learned(tmp_path, killed):
+    long = ["collector=ray", "hydra.run.dir=run", "total_frames=40000", "evaluation.ceilings=false"]
+    command = [sys.executable, str(ROOT / "train.py"), "algo=hdqn", "logger=csv", *TINY, *TINY_HDRQN, *long]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+    wait_until(
+        lambda: (tmp_path / "run/metrics.csv").exists() and "\n1" in (tmp_path / "run/metrics.csv").read_text(), 300
+    )
+    os.kill(descendant(process.pid, killed), signal.SIGKILL)
+    _, told = process.communicate(timeout=120)
+    assert process.returncode == 1
+    assert "must answer until the end, got nothing from 127.0.0.1:" in told
+    assert "; start it again; when that is fixed, `" in told and f"train.py resume={tmp_path}/run` goes on" in told
+    newest = max(int(path.name.rpartition("-")[2]) for path in tmp_path.glob("run/checkpoints/checkpoint-*"))
+    logged = int((tmp_path / "run/metrics.csv").read_text().splitlines()[-1].partition(",")[0])
+    assert 0 <= newest - logged < 500  # a row comes every 500 frames
+
+
+def descendant(pid: int, program: str) -> int:
+    """The process that runs a program, among those that another one has started."""
+    rows = subprocess.run(["ps", "-ewwo", "ppid=,pid=,args="], capture_output=True, text=True, check=True).stdout
+    for parent, child, *words in (line.split() for line in rows.splitlines()):
+        if int(parent) == pid and words and words[0].endswith(program):
+            return int(child)
+    raise AssertionError(rows)
