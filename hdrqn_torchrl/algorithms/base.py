@@ -51,6 +51,15 @@ class Algorithm:
         """Gradient steps of all learners together."""
         return sum(learner.updates for learner in self.learners.values())
 
+    def figures(self) -> dict[str, float]:
+        """Of each learner and exploration, for a row of the table."""
+        learners, explorations = self.learners.items(), self.explorations.items()
+        return {
+            **{f"{name}/updates": learner.updates for name, learner in learners},
+            **{f"{name}/learning_rate": learner.learning_rate for name, learner in learners},
+            **{f"{name}/epsilon": level.epsilon.item() for name, level in explorations},
+        }
+
     def transform(self, env: EnvBase) -> TransformedEnv:
         """The environment with the transforms that this algorithm needs."""
         return TransformedEnv(env, self.make_transforms(), auto_unwrap=True)

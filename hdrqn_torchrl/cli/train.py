@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import random
 import sys
-import traceback
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,12 +18,13 @@ from omegaconf import DictConfig
 from hdrqn_torchrl.cli import launchers, sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
+from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors, telling_how_to_go_on
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
 from hdrqn_torchrl.cli.together import plans, train_together
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build, build_algorithm, build_env
-from hdrqn_torchrl.runs.files import check_file, remove, replaced, write_whole
+from hdrqn_torchrl.runs.files import check_file, remove, replaced
 from hdrqn_torchrl.runs.settings import check, pick_device
 
 if TYPE_CHECKING:
@@ -109,31 +108,11 @@ def pieces(run: Plan, stop: StopRequest) -> Generator[None, None, float]:
         yield
         with noting_errors(run):
             try:
-                yield from trainer.pieces()
+                with telling_how_to_go_on(run, trainer):
+                    yield from trainer.pieces()
             finally:
                 trainer.collector.shutdown()
             return write_summary(run, trainer, evaluation_env, players)["return_mean"]
-
-
-@contextlib.contextmanager
-def in_words(run: Plan) -> Iterator[None]:
-    """Turns errors of the user and of the machine into messages without a traceback."""
-    from torchrl.checkpoint import CheckpointError
-
-    from hdrqn_torchrl.learning.finite import NonFiniteError
-    from hdrqn_torchrl.runs.workers import WorkerError, WorkerLost
-
-    try:
-        yield
-    except SettingsError:
-        raise
-    except ValueError as error:
-        raise SettingsError(str(error)) from error
-    except (CheckpointError, NonFiniteError, WorkerError) as error:
-        raise RunError(str(error)) from error
-    except (OSError, WorkerLost) as error:
-        goes_on = command(run.folder, run.config.allowed_targets)
-        raise RunError(f"{error}; when that is fixed, `{goes_on}` goes on from the last checkpoint.") from error
 
 
 def tell(sentence: str) -> None:
@@ -154,23 +133,6 @@ def never_updated(algorithm: Algorithm, total_frames: int) -> list[str]:
 def tell_of_player(sentence: str) -> None:
     """The same for scripted players, which can be done without."""
     tell(f"{sentence}; evaluation.ceilings=false leaves that out")
-
-
-@contextlib.contextmanager
-def noting_errors(run: Plan, *, unless: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """A training that fails leaves a traceback; one that can't be resumed with new settings has not failed."""
-    try:
-        yield
-    except Exception as error:
-        if not isinstance(error, unless):
-            note_error(run.folder)
-        raise
-
-
-def note_error(folder: Path) -> None:
-    """Writes the traceback of the error at hand to ``error.txt``."""
-    with contextlib.suppress(OSError):
-        write_whole(folder / layout.ERROR, traceback.format_exc())
 
 
 def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 import torch
 from tensordict import TensorDictBase
@@ -133,3 +134,12 @@ def check_batch(batch: TensorDictBase, frames: int) -> None:
             found.append((time, *(cause not in name for cause in (keys.OBSERVATION, keys.REWARD)), name, environment))
     *_, name, environment = min(found)
     raise NonFiniteError(f"{name} holds a NaN or an infinity, environment {environment}, after frame {frames}")
+
+
+@contextmanager
+def naming(learner: str) -> Iterator[None]:
+    """Puts the learner's name before its error."""
+    try:
+        yield
+    except NonFiniteError as error:
+        raise NonFiniteError(f"{learner}: {error}") from error

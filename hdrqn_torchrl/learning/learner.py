@@ -42,9 +42,8 @@ class Learner:
         refresh: applied to every minibatch before it is learned from.
         separate: parts of the network, by prefixes of their parameters' names, that are optimised separately: with
             this share of the learning rate, and with gradients clipped by their own norm.
-        samples_per_draw: minibatches drawn from the memory at once; they are drawn independently of each other,
-            and one large draw costs little more than a small one. Priorities are those of
-            the draw: up to ``samples_per_draw - 1`` updates old.
+        samples_per_draw: minibatches drawn at once, independently: one large draw costs little more than a small one.
+            Priorities are those of the draw: up to ``samples_per_draw - 1`` updates old.
 
     Examples:
         See :func:`hdrqn_torchrl.algorithms.make_drqn`, which builds one.
@@ -63,8 +62,7 @@ class Learner:
         separate: Mapping[str, float] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
-        self.network, self.settings, self.extract, self.refresh = network, settings, extract, refresh
-        self.loss = loss
+        self.network, self.settings, self.loss, self.extract, self.refresh = network, settings, loss, extract, refresh
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
         self.target_updater = SoftTargetUpdate(self.loss, tau=settings.tau)
@@ -174,8 +172,7 @@ class Learner:
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
         if not self._drawn:
-            sequences = sample_sequences(self.buffer, self._sequence_len)
-            self._drawn = list(sequences.split(self.settings.batch_size, 0))
+            self._drawn = list(sample_sequences(self.buffer, self._sequence_len).split(self.settings.batch_size, 0))
         sample = self._drawn.pop()
         return sample if self.refresh is None else self.refresh(sample)
 
@@ -209,9 +206,14 @@ class Learner:
     def _gradient_step(self, sample: TensorDictBase | None, ahead: int | None) -> dict[str, Tensor]:
         """What is captured: the update, and the draw if there is no ``sample``."""
         if sample is None:
-            assert self._draws is not None, "only where updates are captured the device draws"
+            assert self._draws is not None
             sample = self._draws.draw()
         return self._step(sample, self.precision, ahead)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether no update was cut off by an error while it changed weights."""
+        return not self._step.changes
 
     def copy_to_target(self) -> None:
         """Makes the target network the same as the one that is trained."""

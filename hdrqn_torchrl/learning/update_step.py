@@ -44,6 +44,8 @@ class UpdateStep:
     ) -> None:
         self.loss, self.parameters, self.optimizer = loss, parameters, optimizer
         self.target_updater, self.guard, self.max_grad_norm = target_updater, guard, max_grad_norm
+        self.changes = False
+        """Whether weights are being changed, or an error came between."""
 
     def draw_ahead(self, steps: int) -> int | None:
         """What the host decides about an update: how many steps ahead the loss predicts, if it does.
@@ -76,8 +78,10 @@ class UpdateStep:
         if self.max_grad_norm is not None:
             self.optimizer.clip_gradients(self.max_grad_norm, norm)
             report["grad_norm"] = norm
+        self.changes = True
         self.optimizer.step()
         self.target_updater.step()
+        self.changes = False
         return {name: value.detach() for name, value in report.items()}
 
     @contextmanager

@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.learning.captured import CudaRecording, Recording, Replayed
+from hdrqn_torchrl.runs.collectors import has_given_up, new_seed
 from hdrqn_torchrl.transforms import SubgoalTransform
 
 _KNOWN = (InitTracker, TensorDictPrimer, SubgoalTransform)
@@ -50,7 +51,7 @@ class CapturedCollector:
     ) -> None:
         self.env, self.policy, self.total_frames = env, policy, total_frames
         self.frames_per_batch, self.steps = frames_per_batch, frames_per_batch // env.batch_size[0]
-        self._frames, self._batches = 0, 0
+        self._frames, self._batches, self._has_given_up = 0, 0, False
         self._replayed = Replayed(recording(env.base_env.generators), warm_ups)
         self._start = env.reset()  # what primers set
         number = torch.arange(env.batch_size[0], device=self._start.device)
@@ -63,7 +64,29 @@ class CapturedCollector:
         while self.total_frames < 0 or self._frames < self.total_frames:
             yield self._collect()
 
+    def give_up(self, frames: int) -> None:
+        """As that of :class:`~hdrqn_torchrl.runs.collectors.ResumableCollector`."""
+        self._frames, self._has_given_up = frames, True
+
+    def _begin_anew(self) -> None:
+        self.env.set_seed(new_seed())
+        fresh, number = self.env.reset(), torch.arange(self.env.batch_size[0], device=self._root.device)
+        fresh.set(keys.TRAJ_IDS, self._next_episode + number)
+        for key, value in self._root.items(True, True):
+            value.copy_(fresh.get(key))
+        self._next_episode += len(number)
+        self._keep_worlds()
+        self._has_given_up = False
+
+    def _keep_worlds(self) -> None:
+        """What recordings read stays where it is."""
+        for name, value in self.env.base_env.worlds.items():
+            self._worlds[name].copy_(value)
+        self.env.base_env.worlds = self._worlds
+
     def _collect(self) -> TensorDictBase:
+        if self._has_given_up:
+            self._begin_anew()
         batch = TensorDict({}, (self.env.batch_size[0], self.steps), device=self.env.device)
         for key, value in self._replayed(self._rollout).items():
             batch.set(key, value)
@@ -119,15 +142,16 @@ class CapturedCollector:
 
     def state_dict(self) -> dict[str, Any]:
         """As that of :class:`~hdrqn_torchrl.runs.collectors.ResumableCollector`; each can load the other's."""
-        worlds = {name: value.clone() for name, value in self.env.base_env.state_dict().items()}  # replays change them
-        return {
+        state = {
             "env_state_dict": self.env.state_dict(),
             "frames": self._frames,
             "iter": self._batches - 1,
             "traj_pool": {"traj_id": self._next_episode.to("cpu", torch.int32, copy=True)},
-            "base_env": worlds,
-            "carrier": self._root.clone(),
         }
+        if self._has_given_up:
+            return state
+        worlds = {name: value.clone() for name, value in self.env.base_env.state_dict().items()}  # replays change them
+        return state | {"base_env": worlds, "carrier": self._root.clone()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned.
@@ -138,12 +162,13 @@ class CapturedCollector:
         if "workers" in state:
             raise ValueError(f"collector must be one with {len(state['workers'])} workers, as before, got local.")
         self.env.load_state_dict(state["env_state_dict"], strict=False)
-        self.env.base_env.load_state_dict(state["base_env"])
         self._frames, self._batches = state["frames"], state["iter"] + 1
         self._next_episode.copy_(state["traj_pool"]["traj_id"])
-        for name, value in self.env.base_env.worlds.items():
-            self._worlds[name].copy_(value)
-        self.env.base_env.worlds = self._worlds
+        self._has_given_up = has_given_up(state)
+        if self._has_given_up:
+            return
+        self.env.base_env.load_state_dict(state["base_env"])
+        self._keep_worlds()
         for key, value in self._root.items(True, True):
             value.copy_(state["carrier"].get(key))
 

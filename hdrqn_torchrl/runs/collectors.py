@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.collectors import Collector
 from torchrl.envs import TransformedEnv
@@ -33,6 +34,7 @@ class ResumableCollector(Collector):
     """
 
     def __init__(self, *args, **kwargs) -> None:
+        self._has_given_up = False
         super().__init__(*args, **kwargs)
         if _is_empty(self._base_env.state_dict()):
             raise ValueError(
@@ -44,10 +46,34 @@ class ResumableCollector(Collector):
     def _base_env(self):  # noqa: ANN202
         return getattr(self.env, "base_env", self.env)
 
+    def __iter__(self) -> Iterator[TensorDictBase]:
+        """Batches ``[N, T]``. TorchRL's shuts down at an error; this one can still tell its state."""
+        self._iteration_started = True
+        yield from self.iterator()
+
+    def give_up(self, frames: int) -> None:
+        """Forgets a batch in which an error was raised, and the episodes in progress: where it goes on, or its state
+        is loaded, new ones begin, in worlds that it has not shown before.
+
+        Args:
+            frames: of the batches that count.
+        """
+        self._frames, self._has_given_up = frames, True
+
+    def rollout(self) -> TensorDictBase:
+        """The next batch ``[N, T]``."""
+        if self._has_given_up:
+            self.env.set_seed(new_seed())
+            self._make_carrier()
+            self._has_given_up = False
+        return super().rollout()
+
     def state_dict(self) -> dict[str, Any]:
         """TorchRL's state without the policy, which has a checkpoint entry of its own, and with what it lacks."""
         state = super().state_dict()
         state.pop("policy_state_dict", None)
+        if self._has_given_up:
+            return state
         if not isinstance(self.env, TransformedEnv):
             state["env_state_dict"] = self.env.state_dict()
         return {**state, "base_env": self._base_env.state_dict(), "carrier": self._carrier.exclude("next").clone()}
@@ -63,11 +89,24 @@ class ResumableCollector(Collector):
             raise ValueError(f"collector must be one with {len(state_dict['workers'])} workers, as before, got local.")
         super().load_state_dict(state_dict, strict=False)
         self._traj_pool.load_state_dict(state_dict["traj_pool"])  # TorchRL numbered the episodes anew
+        self._has_given_up = has_given_up(state_dict)
+        if self._has_given_up:
+            return
         self._base_env.load_state_dict(state_dict["base_env"])
         _check_like(state_dict["carrier"], self.state_dict()["carrier"], self.env.action_keys)
         self._carrier = state_dict["carrier"].clone()
         if self._carrier_has_no_device:
             self._carrier.clear_device_()
+
+
+def new_seed() -> int:
+    """A seed of worlds by torch's random numbers, which a resumed training finds as they were left."""
+    return int(torch.randint(2**31, ()))
+
+
+def has_given_up(state: Mapping[str, Any]) -> bool:
+    """Whether the state of a collector holds no episodes in progress (:meth:`ResumableCollector.give_up`)."""
+    return "carrier" not in state
 
 
 def _check_like(carrier: TensorDictBase, own: TensorDictBase, chosen: Sequence[NestedKey]) -> None:

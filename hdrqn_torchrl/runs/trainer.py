@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,17 @@ from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.learning import Monitor
-from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch
+from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch, naming
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
-from hdrqn_torchrl.runs.components import components_of, explained
+from hdrqn_torchrl.runs.components import components_of
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
+from hdrqn_torchrl.runs.saving import Saving
 from hdrqn_torchrl.runs.state_checks import rules_of
-from hdrqn_torchrl.runs.window import Window, check_counters
-from hdrqn_torchrl.runs.workers import WorkerLost, WorkersCollector
+from hdrqn_torchrl.runs.window import Window, check_counters, crossed
+from hdrqn_torchrl.runs.workers import WorkersCollector
 
 
 class Trainer:
@@ -73,15 +73,16 @@ class Trainer:
     ) -> None:
         self.algorithm, self.collector, self.logger, self.evaluate = algorithm, collector, logger, evaluate
         self.total_frames, self.log_frames, self.evaluation_frames = total_frames, log_frames, evaluation_frames
-        self.checkpoints, self.checkpoint_frames = checkpoints, checkpoint_frames
-        self.checkpoint_seconds, self.ceiling = checkpoint_seconds, ceiling
+        self.checkpoints, self.checkpoint_frames, self.ceiling = checkpoints, checkpoint_frames, ceiling
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
         self._tracker = EpisodeTracker(algorithm.task)
         self._window = Window()
+        workers = [collector] if isinstance(collector, WorkersCollector) else []
+        self._reporting: list[Monitor | WorkersCollector] = [*algorithm.monitors.values(), *workers]
         self._stop = stop or StopRequest()
-        self._started = self._saved_at = time.monotonic()
-        self._saved_position: tuple | None = None
+        self._started = time.monotonic()
+        self._saving = Saving(checkpoints, self._parts, place=lambda: self._place, seconds=checkpoint_seconds)
 
     @property
     def wall_seconds(self) -> float:
@@ -93,20 +94,16 @@ class Trainer:
         """Gradient steps of all learners together."""
         return self.algorithm.updates
 
-    @property
-    def _reporting(self) -> list[Monitor | WorkersCollector]:
-        """All that has figures for a row."""
-        workers = [self.collector] if isinstance(self.collector, WorkersCollector) else []
-        return [*self.algorithm.monitors.values(), *workers]
-
     def train(self) -> None:
         """Runs to ``total_frames``.
 
         Raises:
             Interrupted: on SIGINT or SIGTERM, after saving. A second signal does not wait for that.
-            WorkerLost: if workers can't be had any more, after saving.
             NonFiniteError: before a NaN or an infinity reaches the weights.
             CheckpointError: if the training can't be saved.
+            Exception: whatever environment, policy or learner raise, after saving. What was collected since the last
+                whole batch is left out, and new episodes begin where the training goes on. An error in the middle of
+                storing a batch or of changing weights leaves nothing that could be saved.
         """
         for _ in self.pieces():
             pass
@@ -129,7 +126,7 @@ class Trainer:
         try:
             yield from self._complete_iteration()
             if self.frames < self.total_frames:
-                for batch in self.collector:
+                for batch in self._collected():
                     yield
                     self._receive(batch)
                     yield from self._complete_iteration()
@@ -139,39 +136,55 @@ class Trainer:
         except Interrupted:
             self.save()
             raise
-        except WorkerLost:
-            assert isinstance(self.collector, WorkersCollector)
-            self.collector.give_up()
-            self.save()
-            raise
         except NonFiniteError as error:
             left = "nothing was saved" if self.checkpoints is None else self.checkpoints.last_good()
             raise NonFiniteError(f"{error}; training stopped before it could reach the weights; {left}.") from error
+        except CheckpointError:
+            raise
+        except Exception as error:
+            if all(learner.is_whole for learner in self.algorithm.learners.values()):
+                self._saving.save_after(error, self.frames)
+            raise
+
+    def _collected(self) -> Iterator[TensorDictBase]:
+        """Batches ``[N, T]``; an error on the way to one costs the episodes in progress and nothing else."""
+        batches = iter(self.collector)
+        while True:
+            try:
+                if (batch := next(batches, None)) is None:
+                    return
+                check_batch(batch, self.frames)
+            except Exception as error:
+                self.collector.give_up(self.frames)
+                self._saving.save_after(error, self.frames)
+                raise
+            yield batch
 
     def step(self, batch: TensorDictBase) -> None:
         """One iteration on a collected batch ``[N, T]``."""
+        check_batch(batch, self.frames)
         self._receive(batch)
         for _ in self._complete_iteration():
             pass
 
     def _receive(self, batch: TensorDictBase) -> None:
         """Counts and stores a collected batch ``[N, T]``."""
-        check_batch(batch, self.frames)
-        self.frames += batch.numel()
-        self.algorithm.observe(batch)
-        finished = self._tracker.finished(batch)
-        self.episodes += len(finished)
-        self._window.add_episodes(finished)
+        with self._saving.in_parts():
+            self.frames += batch.numel()
+            self.algorithm.observe(batch)
+            finished = self._tracker.finished(batch)
+            self.episodes += len(finished)
+            self._window.add_episodes(finished)
 
     def _complete_iteration(self) -> Iterator[None]:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
         for name, learner in self.algorithm.learners.items():
-            with _naming(name):
+            with naming(name):
                 for _ in range(learner.updates_due()):
                     self._stop.check()
                     self._window.add_update(name, learner.learn())
             yield
-            with _naming(name):
+            with naming(name):
                 learner.check_finite()
         self.collector.update_policy_weights_()
         before, best = self._completed, False
@@ -180,8 +193,9 @@ class Trainer:
             if evaluation or self._due(self.log_frames):
                 best = self.log(evaluation=evaluation)
             self._completed = self.frames
-        late = time.monotonic() - self._saved_at >= self.checkpoint_seconds
-        if before is not None and (best or late or crossed(before, self.frames, self.checkpoint_frames)):
+        if before is not None and (
+            best or self._saving.is_late() or crossed(before, self.frames, self.checkpoint_frames)
+        ):
             self.save(score=self.best_return if best else None)
         self._stop.check()
 
@@ -197,9 +211,7 @@ class Trainer:
             "updates": self.updates,
             "wall_seconds": round(self.wall_seconds, 2),
             **self._window.summary(self.frames),
-            **{f"{name}/updates": learner.updates for name, learner in self.algorithm.learners.items()},
-            **{f"{name}/learning_rate": learner.learning_rate for name, learner in self.algorithm.learners.items()},
-            **{f"{name}/epsilon": level.epsilon.item() for name, level in self.algorithm.explorations.items()},
+            **self.algorithm.figures(),
         }
         for monitor in self._reporting:
             row |= monitor.metrics()
@@ -212,10 +224,12 @@ class Trainer:
             }
             if (ceiling := self.ceiling()) is not None:
                 row["greedy/ceiling"] = ceiling
-            if best := result["return_mean"] > self.best_return:
+            best = result["return_mean"] > self.best_return
+        with self._saving.in_parts():
+            if best:
                 self.best_return = result["return_mean"]
-        self.logger.log(row)
-        self._begin_row()
+            self.logger.log(row)
+            self._begin_row()
         return best
 
     def _begin_row(self) -> None:
@@ -225,32 +239,21 @@ class Trainer:
             monitor.clear()
 
     def save(self, *, score: float | None = None) -> None:
-        """Writes a checkpoint of the whole training, unless nothing happened since the last one.
-
-        Args:
-            score: greedy return of these very weights, if it is the best so far.
-        """
-        if self.checkpoints is not None and self._position != self._saved_position:
-            self.checkpoints.save(self._components(), step=self.frames, score=score)
-            self._saved_at, self._saved_position = time.monotonic(), self._position
+        """Writes a checkpoint, unless nothing happened since the last one (:meth:`Saving.save`)."""
+        self._saving.save(self.frames, score=score)
 
     def resume(self, path: Path) -> None:
         """Restores everything from a checkpoint; :meth:`train` then goes on from there, and later ones are removed.
 
         Raises:
-            CheckpointError: if the checkpoint is damaged, of another kind of training, or of phases as earlier versions
-                stored them.
+            CheckpointError: as :meth:`Saving.load`.
         """
         assert self.checkpoints is not None
         device = next(self.algorithm.policy.parameters()).device
         rules = rules_of(self.collector.env) if hasattr(self.collector, "env") else {}  # others are made elsewhere
-        try:
-            missing = self.checkpoints.load(self._components(), path, device=device, rules=rules)
-        except CheckpointError as error:
-            raise explained(error, path) from error
+        missing = self._saving.load(path, device=device, rules=rules)
         self.checkpoints.go_back_to(self.frames)
         self.collector.update_policy_weights_()
-        self._saved_at, self._saved_position = time.monotonic(), self._position
         if missing and not any(len(learner.buffer) for learner in self.algorithm.learners.values()):
             self.logger.say(
                 f"{path.name} holds no replay memory: it begins empty and is warmed up again, so that the training "
@@ -258,11 +261,10 @@ class Trainer:
             )
 
     @property
-    def _position(self) -> tuple[int, int, int | None]:
+    def _place(self) -> tuple[int, int, int | None]:
         return self.frames, self.updates, self._completed
 
-    def _components(self) -> dict[str, Any]:
-        """All that a training consists of. They are restored in the order of their names."""
+    def _parts(self) -> dict[str, Any]:
         return {
             "collector": self.collector,
             **components_of(self.algorithm),
@@ -295,17 +297,3 @@ class Trainer:
         self._started = time.monotonic() - state["wall_seconds"]
         self._tracker.load_state_dict(state["tracker"])
         self._window.load_state_dict(state["window"])
-
-
-def crossed(before: int, after: int, interval: int) -> bool:
-    """Whether a multiple of ``interval`` lies in (before, after]."""
-    return before // interval < after // interval
-
-
-@contextmanager
-def _naming(learner: str) -> Iterator[None]:
-    """Puts the learner's name before its error."""
-    try:
-        yield
-    except NonFiniteError as error:
-        raise NonFiniteError(f"{learner}: {error}") from error

@@ -75,6 +75,11 @@ class Window:
         self._episodes, self._sums, self._counts = state["episodes"], state["sums"], state["counts"]
 
 
+def crossed(before: int, after: int, interval: int) -> bool:
+    """Whether a multiple of ``interval`` lies in (before, after]."""
+    return before // interval < after // interval
+
+
 def check_counters(state: dict[str, Any]) -> None:
     """Refuses a trainer's counters that no training can have.
 

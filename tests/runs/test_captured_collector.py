@@ -129,6 +129,23 @@ class TestState:
         for batch in (last, *take(other, 3)):
             continuity.check(batch)
 
+    @pytest.mark.parametrize("again", [False, True], ids=["the same", "another"])
+    def test_after_an_error_new_episodes_begin_in_all_rows(self, as_on_gpu, again):
+        algorithm, env = make("v3")
+        collector = make_captured(algorithm, env)
+        continuity = Continuity()
+        continuity.check(take(collector, 3)[-1])
+        collector.give_up(48)
+        state = collector.state_dict()
+        if again:
+            collector = make_captured(algorithm, small_env(6, max_steps=5, obstacle="teleport", seed=9))
+            collector.load_state_dict(state)
+        first, second = take(collector, 2)
+        for batch in (first, second):
+            continuity.check(batch)
+        assert first["is_init"][:, 0].all() and not second["is_init"][:, 0].all()
+        assert state["frames"] == 48 and "carrier" in collector.state_dict()
+
     def test_the_number_of_batches_is_that_of_all_frames(self, as_on_gpu):
         algorithm, env = make("drqn")
         assert len(list(make_captured(algorithm, env, total_frames=72))) == 3

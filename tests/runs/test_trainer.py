@@ -58,6 +58,9 @@ class FakeCollector(Stateless):
     def update_policy_weights_(self):
         self.weight_updates += 1
 
+    def give_up(self, frames):
+        self.gave_up_at = frames
+
 
 def quiet_batch(done=False):
     after = {key: torch.zeros(2, 5, 1) for key in ("reward", "extrinsic_reward")}
@@ -142,6 +145,7 @@ class CountingLearner(Stateless):
     """Owes a fixed number of updates for each batch; ``told`` collects the calls."""
 
     learning_rate = 0.001
+    is_whole = True
 
     def state_dict(self, memory=True):
         return {}
@@ -264,12 +268,12 @@ class TestWhenItSaves:
         assert saved(at=stop, error=Interrupted, checkpoint_frames=30) == [30]
         assert saved(total_frames=90, checkpoint_frames=30) == [30, 60, 90]
 
-    @pytest.mark.parametrize("error", [KeyboardInterrupt, RuntimeError])
-    def test_no_checkpoint_is_saved_after_an_error(self, saved, error):
+    @pytest.mark.parametrize(("error", "steps"), [(KeyboardInterrupt, [20]), (RuntimeError, [20, 30])])
+    def test_a_checkpoint_is_saved_after_an_error_but_not_after_a_second_stop_signal(self, saved, error, steps):
         def fail():
             raise error
 
-        assert saved(at={4: fail}, error=error, checkpoint_frames=20) == [20]
+        assert saved(at={4: fail}, error=error, checkpoint_frames=20) == steps
 
     def test_training_works_without_checkpoints(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)

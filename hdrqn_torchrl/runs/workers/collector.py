@@ -191,8 +191,13 @@ class WorkersCollector:
         self.lost_episodes += self.worlds
         self._first_ids[index] = self._next_ids[index]
 
-    def give_up(self) -> None:
-        """Counts all workers as lost. They are asked nothing any more, and others begin where this state is loaded."""
+    def give_up(self, frames: int) -> None:
+        """Counts all workers as lost. They are asked nothing any more, and others begin where this state is loaded.
+
+        Args:
+            frames: of the batches that count.
+        """
+        self.frames, self._ready = frames, None
         if not self._has_given_up:
             self._has_given_up, self._ordered = True, False
             for index in range(len(self._starts)):

@@ -1,0 +1,107 @@
+"""What a training that fails says and leaves behind: why, a traceback, and the command that goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import hdrqn_torchrl
+from hdrqn_torchrl.cli.configuration import RunError
+from hdrqn_torchrl.cli.resuming import Plan, command
+from hdrqn_torchrl.runs import layout
+from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.files import write_whole
+
+if TYPE_CHECKING:
+    from hdrqn_torchrl.runs.trainer import Trainer
+
+_OURS = Path(hdrqn_torchrl.__file__).parent
+
+
+@contextlib.contextmanager
+def in_words(run: Plan) -> Iterator[None]:
+    """Turns errors of the user and of the machine into messages without a traceback."""
+    from torchrl.checkpoint import CheckpointError
+
+    from hdrqn_torchrl.learning.finite import NonFiniteError
+    from hdrqn_torchrl.runs.workers import WorkerError
+
+    try:
+        yield
+    except SettingsError:
+        raise
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
+    except (CheckpointError, NonFiniteError, WorkerError) as error:
+        raise RunError(str(error)) from error
+    except OSError as error:
+        goes_on = command(run.folder, run.config.allowed_targets)
+        raise RunError(f"{error}; when that is fixed, `{goes_on}` goes on from the last checkpoint.") from error
+
+
+@contextlib.contextmanager
+def noting_errors(run: Plan, *, unless: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """A training that fails leaves a traceback; one that can't be resumed with new settings has not failed."""
+    try:
+        yield
+    except Exception as error:
+        if not isinstance(error, unless):
+            note_error(run.folder)
+        raise
+
+
+def note_error(folder: Path) -> None:
+    """Writes the traceback of the error at hand to ``error.txt``."""
+    with contextlib.suppress(OSError):
+        write_whole(folder / layout.ERROR, traceback.format_exc())
+
+
+@contextlib.contextmanager
+def telling_how_to_go_on(run: Plan, trainer: Trainer) -> Iterator[None]:
+    """Ends a training's error with what was saved and the command that goes on from there.
+
+    The traceback is printed if the error comes from code outside this package: somebody is going to look for it there.
+    """
+    from torchrl.checkpoint import CheckpointError
+
+    from hdrqn_torchrl.learning.finite import NonFiniteError
+
+    try:
+        yield
+    except CheckpointError:  # it says what was saved
+        raise
+    except NonFiniteError as error:
+        goes_on = command(run.folder, run.config.allowed_targets)
+        raise RunError(f"{error} When that is fixed, `{goes_on}` goes on.") from error
+    except Exception as error:
+        if not _is_ours(error):
+            traceback.print_exc()
+        raise RunError(_told(error, run, trainer)) from error
+
+
+def _is_ours(error: Exception) -> bool:
+    """Whether it was raised by this package, in words for its user, or by the machine."""
+    from hdrqn_torchrl.runs.workers import WorkerError
+
+    *_, (frame, _) = traceback.walk_tb(error.__traceback__)
+    return isinstance(error, (OSError, WorkerError)) or Path(frame.f_code.co_filename).is_relative_to(_OURS)
+
+
+def _told(error: Exception, run: Plan, trainer: Trainer) -> str:
+    """A paragraph: what, where, what is left, and how to go on."""
+    from hdrqn_torchrl.runs.checkpoint import Checkpoints
+
+    newest = Checkpoints(run.folder / layout.CHECKPOINTS).newest()
+    what = str(error) if _is_ours(error) else f"{type(error).__name__}: {error}"
+    where = f"after frame {trainer.frames:,}, seed {run.config.seed}"
+    goes_on = f"when that is fixed, `{command(run.folder, run.config.allowed_targets)}`"
+    end = (
+        f"{goes_on} begins again, as nothing was saved before"
+        if newest is None
+        else f"{goes_on} goes on from the last checkpoint, {newest.name}"
+    )
+    notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
+    return f"{what} ({where}; traceback in {run.folder / layout.ERROR}); {end}.{notes}"
