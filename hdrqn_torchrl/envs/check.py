@@ -17,7 +17,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.check_choices import check_masks, check_observation, random_actions
-from hdrqn_torchrl.envs.findings import Finding, missing, wrong
+from hdrqn_torchrl.envs.findings import Finding, ReturnError, missing, wrong
 from hdrqn_torchrl.envs.observations import ProblemOf
 from hdrqn_torchrl.envs.specs import check_is_environment
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
@@ -60,7 +60,10 @@ def check_task(
     found = [*_entries(env, task), *check_observation(env, network_problem), *_statement(env, task)]
     if not any(finding.severity == "wrong" for finding in found):  # else it can't be stepped as agents do
         with own_random_numbers(seed):
-            found += _behaviour(env, task, steps, seed)
+            try:
+                found += _behaviour(env, task, steps, seed)
+            except ReturnError as error:
+                found.append(wrong(str(error), "training stops there"))
     return sorted(dict.fromkeys(found), key=lambda finding: finding.severity != "wrong")
 
 

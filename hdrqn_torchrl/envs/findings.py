@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 
+class ReturnError(ValueError):
+    """An environment returned what its spaces, or the rules of Gymnasium, do not allow."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """Something that an environment does wrong or lacks.

@@ -54,7 +54,7 @@ class GymTaskEnv(EnvBase):
     ) -> None:
         super().__init__(device=torch.device(device or "cpu"), batch_size=(num_envs,))
         self.worlds, self.task, self._render = worlds, task, render
-        self._actions = np.array(actions, np.int64)
+        self._actions, self._reading = np.array(actions, np.int64), reading
         sizes = {key: space.shape[0] for key, space in reading.space.items() if key != keys.OBSERVATION and space.shape}
         self.observation_spec = Composite(
             {
@@ -80,6 +80,7 @@ class GymTaskEnv(EnvBase):
         chosen = np.ones(self.num_worlds, np.bool_) if mask is None else mask.view(-1).cpu().numpy()
         chosen = chosen if self._entries else np.ones_like(chosen)  # after a new seed all begin
         begun = self.worlds.reset(chosen)
+        self._reading.encoder.check_finite(begun[keys.OBSERVATION])
         if not self._entries:
             self._entries = {key: value.copy() for key, value in begun.items()}
         for key, value in self._entries.items():
@@ -94,6 +95,7 @@ class GymTaskEnv(EnvBase):
         if self._lost:
             return self._cut_off()
         outcome = self.worlds.step(self._actions[tensordict.get(keys.ACTION).cpu().numpy()])
+        self._reading.encoder.check_finite(outcome.entries[keys.OBSERVATION])
         self._entries = {key: np.array(value) for key, value in outcome.entries.items()}
         return self._tensordict(
             {

@@ -160,7 +160,10 @@ def _read(
 ) -> tuple[Reading, tuple[int, ...]]:
     """How entries are read, and the numbers of the agent's actions, for the spaces of one world."""
     numbers = actions_of(acted, actions)
-    return Reading(encoder=make_encoder(observed, **options), masked_actions=numbers if masked else (), **rest), numbers
+    first = int(acted.start)  # type: ignore[attr-defined]
+    places = tuple(number - first for number in numbers) if masked else ()
+    encoder = make_encoder(observed, **options)
+    return Reading(encoder=encoder, masked_actions=places, num_actions=int(acted.n), **rest), numbers  # type: ignore[attr-defined]
 
 
 def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, processes: bool) -> _Made:

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from hdrqn_torchrl.envs.gym.returned import truths_of
 from hdrqn_torchrl.envs.task import SubgoalSet
 
 Flags = NDArray[np.bool_]
@@ -87,6 +88,10 @@ class SubgoalRecord:
         self.subgoals, self.env = deepcopy(subgoals), env
         self._held = self._attained = np.zeros(len(subgoals.names), np.bool_)
         self._keys = subgoals.stated.keys
+        self._rules = {
+            method: f"what subgoals.{method} returns, one for each of the names {list(subgoals.names)},"
+            for method in ("conditions", "available")
+        }
 
     def begin(self, observation: Any, info: Mapping[str, Any]) -> dict[str, Flags]:
         """Entries at the start of an episode: what holds already is not attained."""
@@ -117,10 +122,4 @@ class SubgoalRecord:
         return {self._keys.attained: attained, self._keys.available: available}
 
     def _flags(self, method: str, found: Sequence[bool] | Flags) -> Flags:
-        flags = np.asarray(found, np.bool_)
-        if flags.shape != self._held.shape:
-            raise ValueError(
-                f"subgoals.{method} must return a truth value for each of the {len(self._held)} names "
-                f"{list(self.subgoals.names)}, got {found!r}."
-            )
-        return flags
+        return truths_of(found, len(self._held), self._rules[method])

@@ -154,8 +154,8 @@ class GivenWorlds(_WithoutState):
             begun, about_begun = after, told
             if resets := same_step and (terminated[index] or truncated[index]):
                 after, told = told["final_obs"], told.get("final_info", {})
-            ends = bool(terminated[index]), bool(truncated[index])
-            self._rows[index], rewards[index] = world.step(after, float(reward[index]), *ends, told)
+            ends = terminated[index], truncated[index]
+            self._rows[index], rewards[index], *_ = world.step(after, reward[index], *ends, told)
             if resets:
                 self._begun[index] = world.begin(begun, about_begun)
         return Outcome(_stacked(self._rows), rewards, terminated, truncated & ~terminated)
@@ -195,9 +195,8 @@ class PooledWorlds(_WithoutState):
         shown, reward, terminated, truncated, info = self.pool.step(actions.astype(np.int32))
         rewards = np.zeros(len(self._worlds), np.float32)
         for index, world in enumerate(self._worlds):
-            ends = bool(terminated[index]), bool(truncated[index])
-            told = _info_of(info, index)
-            self._rows[index], rewards[index] = world.step(_row(shown, index), float(reward[index]), *ends, told)
+            ends, told = (terminated[index], truncated[index]), _info_of(info, index)
+            self._rows[index], rewards[index], *_ = world.step(_row(shown, index), reward[index], *ends, told)
         return Outcome(_stacked(self._rows), rewards, terminated, truncated & ~terminated)
 
 

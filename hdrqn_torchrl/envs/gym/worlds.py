@@ -15,11 +15,22 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.envs.gym.observations import Encoder
+from hdrqn_torchrl.envs.findings import ReturnError
+from hdrqn_torchrl.envs.gym.encoder import Encoder
+from hdrqn_torchrl.envs.gym.returned import (
+    check_readable,
+    info_of,
+    number_of,
+    parts_of,
+    shown,
+    truth_of,
+    truths_of,
+)
 from hdrqn_torchrl.envs.gym.subgoals import SubgoalRecord, Subgoals
 
 Entries = dict[str, NDArray]
 _BOOL: Any = np.bool_  # which Gymnasium's annotations leave out
+Stepped = tuple[Entries, float, bool, bool]
 Rule = Callable[[float, Mapping[str, Any]], float]
 MOST_ACTIONS = 10_000
 """A longer episode cannot be brought back by its actions: they would be kept, and repeated, without bound."""
@@ -35,8 +46,9 @@ class Reading:
         success: name of an entry of ``info``, or a function of (reward, info); ``None``: nothing is known of it.
         hazard: the same for what is to be avoided.
         reward: the same for a reward in place of the environment's own.
-        masked_actions: numbers of the agent's actions, if ``info["action_mask"]`` tells which ones of the environment's
-            can be chosen; empty if it does not.
+        masked_actions: the agent's actions by their places among the environment's, if ``info["action_mask"]`` tells
+            which ones of the environment's can be chosen; empty if it does not.
+        num_actions: how many actions the environment has.
     """
 
     encoder: Encoder
@@ -45,6 +57,7 @@ class Reading:
     hazard: str | Rule | None = None
     reward: str | Rule | None = None
     masked_actions: tuple[int, ...] = ()
+    num_actions: int = 0
 
     @cached_property
     def space(self) -> spaces.Dict:
@@ -77,26 +90,27 @@ class World:
     def begin(self, observation: Any, info: Mapping[str, Any]) -> Entries:
         """Entries at the start of an episode."""
         self.shown = observation
-        entries = self._entries(observation, info)
+        entries = self._entries(observation, info_of(info, "reset"), over=False)
         for record in self._records:
             entries |= record.begin(observation, info)
         no = np.zeros(1, np.bool_)
         return entries | {key: no for key in (keys.SUCCESS, keys.HAZARD) if key in self.reading.space.spaces}
 
-    def step(
-        self, observation: Any, reward: float, terminated: bool, truncated: bool, info: Mapping[str, Any]
-    ) -> tuple[Entries, float]:
-        """Entries after a step, and its reward."""
+    def step(self, observation: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> Stepped:
+        """Entries after a step, its reward, and whether the episode terminated or was truncated, as returned."""
+        reward, info = number_of(reward, "reward"), info_of(info, "step")
+        terminated, truncated = truth_of(terminated, "terminated"), truth_of(truncated, "truncated")
         told = {"reward": reward, "terminated": terminated, "truncated": truncated, **info}
-        entries = self._entries(observation, info)
+        entries = self._entries(observation, info, over=terminated or truncated)
         for record in self._records:
             entries |= record.step(self.shown, observation, told)
         self.shown = observation
         for key, rule in ((keys.SUCCESS, self.reading.success), (keys.HAZARD, self.reading.hazard)):
             if rule is not None:
-                entries[key] = np.array([bool(_applied(rule, reward, told, key))])
-        rule = self.reading.reward
-        return entries, reward if rule is None else float(_applied(rule, reward, told, "reward"))
+                entries[key] = np.array([truth_of(_applied(rule, reward, told, key), key)])
+        if (rule := self.reading.reward) is not None:
+            reward = number_of(_applied(rule, reward, told, "reward"), "reward")
+        return entries, reward, terminated, truncated
 
     def subgoals_state(self) -> list[dict[str, list[bool]]]:
         """What was attained so far, as plain data."""
@@ -109,10 +123,15 @@ class World:
             record.load_state_dict(state)
         return {keys.OBSERVATION: self.reading.encoder.encode(shown)}
 
-    def _entries(self, observation: Any, info: Mapping[str, Any]) -> Entries:
+    def _entries(self, observation: Any, info: Mapping[str, Any], *, over: bool) -> Entries:
         entries: Entries = {keys.OBSERVATION: self.reading.encoder.encode(observation)}
         if self.reading.masked_actions:
-            entries[keys.ACTION_MASK] = _action_mask(info, self.reading.masked_actions)
+            entries[keys.ACTION_MASK] = _action_mask(info, self.reading, over=over)
+        elif keys.ACTION_MASK in info:
+            raise ReturnError(
+                "info['action_mask'] must be there at the first reset, too, and was not; an environment either always "
+                "tells which actions can be chosen, or never."
+            )
         return entries
 
 
@@ -124,14 +143,23 @@ def _applied(rule: str | Rule, reward: float, info: Mapping[str, Any], name: str
     return info[rule]
 
 
-def _action_mask(info: Mapping[str, Any], actions: tuple[int, ...]) -> NDArray[np.bool_]:
-    mask = info.get(keys.ACTION_MASK)
-    if mask is None or np.ndim(mask) != 1 or len(mask) <= max(actions):
-        raise ValueError(
-            f"info['action_mask'] must have a truth value for each action at resets and after every step, got {mask!r}"
-            "; an environment either always tells which actions can be chosen, or never."
+def _action_mask(info: Mapping[str, Any], reading: Reading, *, over: bool) -> NDArray[np.bool_]:
+    """Which of the agent's actions can be chosen: at least one, until the episode is over."""
+    if (mask := info.get(keys.ACTION_MASK)) is None:
+        raise ReturnError(
+            f"info['action_mask'] must be there at resets and after every step, info has {sorted(map(str, info))}; an "
+            "environment either always tells which actions can be chosen, or never."
         )
-    return np.asarray(mask, np.bool_)[list(actions)]
+    allowed = truths_of(mask, reading.num_actions, "info['action_mask'], one for each action,")
+    chosen = allowed[list(reading.masked_actions)]
+    if not over and not chosen.any():
+        among = "" if len(chosen) == len(allowed) else " (actions=...)"
+        raise ReturnError(
+            f"info['action_mask'] must allow one of the agent's actions{among} until the episode is over, got "
+            f"{shown(mask.tolist() if isinstance(mask, np.ndarray) else mask)}; end the episode where nothing can be "
+            "done, or give the agent an action that can be chosen there."
+        )
+    return chosen
 
 
 class WorldWrapper(gymnasium.Wrapper):
@@ -160,7 +188,12 @@ class WorldWrapper(gymnasium.Wrapper):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Entries, dict[str, Any]]:
         """A new episode; see :class:`gymnasium.Env`."""
-        observation, info = self.env.reset(seed=seed, options=options)
+        try:
+            returned = self.env.reset(seed=seed, options=options)
+        except (ValueError, TypeError, AssertionError) as error:
+            check_readable(error, "reset")
+            raise
+        observation, info = parts_of(returned, "reset")
         self._seed, self._actions = seed, []
         self.entries = self.world.begin(observation, info)
         return self.entries, {}
@@ -169,9 +202,13 @@ class WorldWrapper(gymnasium.Wrapper):
         """One step; see :class:`gymnasium.Env`. An episode that terminates is not truncated."""
         if self._state is None:
             self._keep(int(action))
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self.entries, reward = self.world.step(observation, float(reward), bool(terminated), bool(truncated), info)
-        return self.entries, reward, bool(terminated), bool(truncated and not terminated), {}
+        try:
+            returned = self.env.step(action)
+        except (ValueError, TypeError, AssertionError) as error:
+            check_readable(error, "step")
+            raise
+        self.entries, reward, terminated, truncated = self.world.step(*parts_of(returned, "step"))
+        return self.entries, reward, terminated, truncated and not terminated, {}
 
     def _keep(self, action: int) -> None:
         if self._actions is not None and len(self._actions) < MOST_ACTIONS:

@@ -248,7 +248,7 @@ def test_subgoals_that_return_a_wrong_number_of_conditions_are_refused():
         def conditions(self, env, before, after, info):
             return (True,)
 
-    with pytest.raises(ValueError, match=r"subgoals.conditions must return a truth value for each of the 2 names"):
+    with pytest.raises(ValueError, match=r"what subgoals.conditions returns, one for .* must be 2 truth values"):
         make_gym(Counter, 2, subgoals=Wrong()).reset()
 
 
