@@ -27,6 +27,7 @@ them (on the grids: "memory", which has the agent's own view; "egocentric" must 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from dataclasses import dataclass, field
@@ -80,7 +81,8 @@ def run(settings: Settings) -> None:
         check_place(Path(settings.out), "out")
     if settings.figures is not None:
         check_place(Path(settings.figures) / "legs.png", "figures")
-    played, agent, observers = evaluate_run(settings)
+    with contextlib.redirect_stdout(sys.stderr):  # worlds may print, and only the result belongs there
+        played, agent, observers = evaluate_run(settings)
     result = json.dumps(played, indent=2)
     print(result, flush=True)  # first: no later error can lose it
     try:

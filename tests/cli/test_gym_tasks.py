@@ -85,3 +85,13 @@ def test_every_setting_that_imports_is_refused_unless_it_is_allowed(settings):
 def test_entries_of_info_and_known_packages_import_nothing_of_a_users():
     env = {"_target_": "hdrqn_torchrl.envs.make_gym", "id": "ALE/Pong-v5", "package": "ale_py", "success": "is_success"}
     assert imports_of(env) == []
+
+
+def test_worlds_that_print_leave_the_result_of_an_evaluation_alone(run, monkeypatch, capsys):
+    import gym_toys
+
+    shown = gym_toys.Counter._shown
+    monkeypatch.setattr(gym_toys.Counter, "_shown", lambda self: print("a world speaks") or shown(self))
+    evaluated(run, monkeypatch, TRUSTED)
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["episodes"] == 4 and "a world speaks" in printed.err

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Sized
 from enum import IntEnum
 from typing import Any
 
@@ -77,7 +77,35 @@ def rule_of(name: str, rule: str | Rule | None) -> str | Rule | None:
 
 def wrappers_of(given: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str]) -> list[Callable]:
     """Wrappers, with names looked up."""
-    return [_named("wrappers", each) for each in given]
+    found = [_named("wrappers", each) for each in given]
+    for each in found:
+        if not callable(each):
+            raise ValueError(
+                f"wrappers must be functions or classes that take a world, got {each!r}; name one as 'module.Wrapper'."
+            )
+    return found
+
+
+def refuse_ignored(what: str, arguments: Mapping[str, Any], *, remedy: str) -> None:
+    """Refuses arguments that would change nothing.
+
+    Args:
+        what: which they don't go with.
+        arguments: they, by name; ``None``, ``False`` and what is empty count as left out.
+        remedy: what to do instead.
+
+    Raises:
+        ValueError: naming the first.
+
+    Examples:
+        >>> refuse_ignored("a vector", {"package": None, "wrappers": [], "max_steps": 3}, remedy="make it so")
+        Traceback (most recent call last):
+        ValueError: max_steps must be left out with a vector, got 3; make it so.
+    """
+    for name, value in arguments.items():
+        is_empty = isinstance(value, Sized) and not len(value)
+        if value is not None and value is not False and not is_empty:
+            raise ValueError(f"{name} must be left out with {what}, got {value!r}; {remedy}.")
 
 
 def _named(argument: str, value: Any) -> Any:
@@ -106,6 +134,14 @@ def import_package_of(id: str, package: str | None = None) -> None:
             gymnasium.register_envs(importlib.import_module(name))
         except ImportError as error:
             raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it.") from error
+        if name == "minigrid":
+            _silence_babyai()
+
+
+def _silence_babyai() -> None:
+    """BabyAI prints a line for every world that it draws in vain, and knows no switch for it."""
+    level: Any = importlib.import_module("minigrid.envs.babyai.core.roomgrid_level")
+    level.print = lambda *_: None
 
 
 def make_world(

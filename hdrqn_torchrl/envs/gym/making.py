@@ -21,6 +21,7 @@ from hdrqn_torchrl.envs.gym.arguments import (
     actions_of,
     import_package_of,
     make_world,
+    refuse_ignored,
     rule_of,
     settings_error,
     subgoals_of,
@@ -75,7 +76,7 @@ def make_gym(
         settings: keyword arguments for ``gymnasium.make``.
         package: that registers the id when it is imported, if it is none of
             :data:`~hdrqn_torchrl.envs.gym.arguments.PACKAGES`.
-        wrappers: put around every world, the first one innermost.
+        wrappers: put around every world, the first one innermost; neither EnvPool's worlds nor a given vector take any.
         entries, channels, codes, words, text_length: of observations; see
             :func:`~hdrqn_torchrl.envs.gym.make_encoder`.
         actions: numbers of the actions that the agent has; ``None``: all.
@@ -112,9 +113,17 @@ def make_gym(
             **{key: rule_of(key, rule) for key, rule in (("reward", reward), ("success", success), ("hazard", hazard))},
         },
     )
+    ours = {"wrappers": wrappers, "package": package, "processes": processes}
     if isinstance(id, VectorEnv):
+        other = None if backend == "gymnasium" else backend
+        refuse_ignored(
+            "a vector of worlds that was made elsewhere",
+            {**ours, "settings": settings, "max_steps": max_steps, "backend": other},
+            remedy="give it to what makes the vector",
+        )
         made = _given(id, num_envs, read)
     elif backend == "envpool":
+        refuse_ignored("backend='envpool'", ours, remedy="use backend='gymnasium', whose worlds are made here")
         made = _pooled(id, num_envs, read, {**(settings or {}), **_limit(max_steps)})
     elif backend == "gymnasium":
         made = _own(

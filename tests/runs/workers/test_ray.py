@@ -92,7 +92,7 @@ def test_a_cluster_that_has_gone_ends_the_collection_and_the_state_can_be_saved(
     with pytest.raises(PlaceLost, match=r"the Ray cluster at 127\.0\.0\.1:\d+ must answer until the end, got nothing"):
         for _ in range(10**6):
             next(batches)
-    collector.give_up()
+    collector.give_up(collector.frames)
     assert collector.state_dict()["workers"] == [None, None]
 
 
