@@ -241,6 +241,7 @@ def _make_network(
         hidden_size=memory_size,
         head_size=head_size,
         joint=joint,
+        memory_span=architecture.memory_span,
         predictor=predictor,
     )
 

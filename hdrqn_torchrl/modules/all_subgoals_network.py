@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hdrqn_torchrl.devices import on_host
 from hdrqn_torchrl.modules.features import Features
-from hdrqn_torchrl.modules.lstm import Gaps, lstm_weights, restarting_lstm
+from hdrqn_torchrl.modules.lstm import Gaps, lstm_weights, remember_for, restarting_lstm
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.q_network import ExactLinear, State, dueling
 from hdrqn_torchrl.modules.sizes import check_size
@@ -33,6 +33,7 @@ class AllSubgoalsNetwork(nn.Module):
         hidden_size: H, size of the LSTM.
         head_size: number of units in the hidden layer of each head.
         joint: whether the top level also trains the memory; ``False``: it only reads it.
+        memory_span: the steps that a new memory keeps things for; see :func:`~hdrqn_torchrl.modules.lstm.remember_for`.
         predictor: predicts observations from the memory, as an auxiliary task; not used for acting.
 
     Raises:
@@ -59,6 +60,7 @@ class AllSubgoalsNetwork(nn.Module):
         hidden_size: int = 128,
         head_size: int = 128,
         joint: bool = True,
+        memory_span: int = 0,
         predictor: ObservationPredictor | None = None,
     ) -> None:
         super().__init__()
@@ -73,6 +75,7 @@ class AllSubgoalsNetwork(nn.Module):
         self.num_actions, self.num_subgoals = num_actions, tuple(subgoals)
         self.register_buffer("_one_hot", torch.eye(num_actions), persistent=False)
         self.memory = nn.LSTM(features.out_features + num_actions, hidden_size, batch_first=True)
+        remember_for(self.memory, memory_span)
         self._conditions = [*subgoals, 1]
         # What a subgoal is worth depends on which are left: the heads read that, so the memory need not keep track.
         inputs = [hidden_size, *(hidden_size + number for number in subgoals)]

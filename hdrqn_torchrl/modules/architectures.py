@@ -37,12 +37,14 @@ class Architecture:
         observation_features: makes the feature extractor for an observation spec ``[N, ...]``.
         vector_features: makes the feature extractor for a vector of a given size (v2's meta-controller).
         gate_features: whether the subgoal also scales the features, besides being appended to them.
+        memory_span: the steps that a new LSTM keeps things for; 0: as PyTorch makes it, which forgets half in a step.
         observation_problem: takes an observation's spec and its shape without the batch dimensions; returns what an
             observation must be and what to do about it, or ``None`` if this one can be read.
     """
 
     hidden_size: int
     gate_features: bool = False
+    memory_span: int = 0
     observation_features: Callable[[TensorSpec], Features]
     vector_features: Callable[[int], Features]
     observation_problem: ProblemOf = lambda spec, shape: None
@@ -95,11 +97,12 @@ class Architecture:
             num_conditions=num_conditions,
             gate_features=self.gate_features,
             recurrent=recurrent,
+            memory_span=self.memory_span,
             predictor=predictor,
         )
 
 
-def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Architecture:
+def paper_network(hidden_size: int = 256, *, gate_features: bool = False, memory_span: int = 0) -> Architecture:
     """The paper's networks: 44x44x3 image, 4 conv + ReLU (or 4 dense + ReLU on a vector) -> 256 -> LSTM -> dueling.
 
     Cell codes are drawn as an image inside the network; other codes are read as a vector.
@@ -107,6 +110,7 @@ def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Arc
     Args:
         hidden_size: H, size of the LSTM.
         gate_features: whether the subgoal also scales the features, besides being appended to them.
+        memory_span: as in :class:`Architecture`.
     """
 
     dense = (256, 256, 256, 256)
@@ -119,6 +123,7 @@ def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Arc
     return Architecture(
         hidden_size=hidden_size,
         gate_features=gate_features,
+        memory_span=memory_span,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, dense),
         observation_problem=observation_problem,
@@ -126,7 +131,7 @@ def paper_network(hidden_size: int = 256, *, gate_features: bool = False) -> Arc
 
 
 def compact_network(
-    hidden_size: int = 64, widths: Sequence[int] = (128,), *, gate_features: bool = True
+    hidden_size: int = 64, widths: Sequence[int] = (128,), *, gate_features: bool = True, memory_span: int = 0
 ) -> Architecture:
     """Small networks on the same information: one-hot codes (or a narrow stack of convolutions) -> LSTM -> dueling.
 
@@ -134,6 +139,7 @@ def compact_network(
         hidden_size: H, size of the LSTM.
         widths: sizes of the dense layers, at least one.
         gate_features: whether the subgoal also scales the features, besides being appended to them.
+        memory_span: as in :class:`Architecture`.
 
     Raises:
         ValueError: if a size is not positive.
@@ -146,6 +152,7 @@ def compact_network(
     return Architecture(
         hidden_size=hidden_size,
         gate_features=gate_features,
+        memory_span=memory_span,
         observation_features=observation_features,
         vector_features=lambda size: FullyConnectedFeatures(size, sizes),
         observation_problem=observation_problem,

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from hdrqn_torchrl.devices import autocast_dtype, multiplies_bfloat16, on_host
+from hdrqn_torchrl.modules.sizes import check_size
 
 CLOSED = -1e4
 """Gate input at a gap; its sigmoid is zero in every floating-point format."""
@@ -95,6 +96,38 @@ def lstm_weights(lstm: nn.LSTM) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         getattr(lstm, name) for name in ("weight_ih_l0", "weight_hh_l0", "bias_ih_l0", "bias_hh_l0")
     )
     return weight_ih, weight_hh, bias_ih, bias_hh
+
+
+def remember_for(lstm: nn.LSTM, steps: int) -> None:
+    """Sets the gates' biases so that a new ``lstm`` remembers for up to so many steps (Tallec and Ollivier, 2018).
+
+    PyTorch draws biases around zero: forget gates are half open, and of what a cell holds and of its gradient a
+    millionth is left after 20 steps. Here the biases of forget gates are log(u) with u uniform between 1 and steps - 1,
+    so cells forget within u + 1 steps, and those of the gates that write are the opposite.
+
+    Args:
+        lstm: of one layer; changed in place.
+        steps: the longest time between what has to be remembered and its use; 0 changes nothing.
+
+    Raises:
+        ValueError: if ``steps`` is not 0 and less than 3.
+
+    Examples:
+        >>> lstm = nn.LSTM(3, 2, batch_first=True)
+        >>> remember_for(lstm, 50)
+        >>> bool((lstm_weights(lstm)[2][2:4].sigmoid() >= 0.5).all())
+        True
+    """
+    check_size("memory_span", steps, "the steps between a hint and its use, or 0 for PyTorch's own biases", least=0)
+    if steps == 0:
+        return
+    check_size("memory_span", steps, "the steps between a hint and its use, or 0 for PyTorch's own biases", least=3)
+    _, _, bias_ih, bias_hh = lstm_weights(lstm)
+    size = lstm.hidden_size
+    with torch.no_grad():
+        kept = torch.empty(size).uniform_(1, steps - 1).log_()
+        bias_hh[: 2 * size] = 0.0
+        bias_ih[:size], bias_ih[size : 2 * size] = -kept, kept
 
 
 def restarting_lstm(lstm: nn.LSTM, inputs: Tensor, init: Tensor, state: tuple[Tensor, Tensor]) -> Tensor:

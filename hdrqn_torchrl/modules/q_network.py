@@ -8,7 +8,7 @@ from torch.nn.utils.rnn import pack_padded_sequence
 
 from hdrqn_torchrl.devices import autocast_dtype, on_host
 from hdrqn_torchrl.modules.features import Features
-from hdrqn_torchrl.modules.lstm import lstm_weights, restarting_lstm
+from hdrqn_torchrl.modules.lstm import lstm_weights, remember_for, restarting_lstm
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.sizes import check_size
 
@@ -57,6 +57,7 @@ class QNetwork(nn.Module):
         gate_features: whether the condition also scales each feature by a learned factor. Only appended, it is a weak
             signal: "go to goal k" needs the product of what is seen and which goal is wanted.
         recurrent: ``False`` replaces the LSTM by a dense layer with ReLU.
+        memory_span: the steps that a new memory keeps things for; see :func:`~hdrqn_torchrl.modules.lstm.remember_for`.
         predictor: predicts observations from the memory, as an auxiliary task; not used for acting.
 
     Raises:
@@ -82,6 +83,7 @@ class QNetwork(nn.Module):
         num_conditions: int = 0,
         gate_features: bool = False,
         recurrent: bool = True,
+        memory_span: int = 0,
         predictor: ObservationPredictor | None = None,
     ) -> None:
         super().__init__()
@@ -96,6 +98,7 @@ class QNetwork(nn.Module):
         size = features.out_features + num_conditions
         if recurrent:
             self.memory: nn.Module = nn.LSTM(size, hidden_size, batch_first=True)
+            remember_for(self.memory, memory_span)
         else:
             self.memory = nn.Sequential(nn.Linear(size, hidden_size), nn.ReLU())
         self.register_buffer("_one_hot", torch.eye(num_conditions), persistent=False)

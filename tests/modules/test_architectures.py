@@ -4,6 +4,7 @@ from helpers import small_env
 from torch import nn
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, Unbounded
 
+from hdrqn_torchrl.algorithms import make_drqn, make_v3
 from hdrqn_torchrl.modules import Architecture, CellsToImage, compact_network, observation_predictor, paper_network
 
 IMAGE = Bounded(0, 255, shape=(4, 3, 44, 44), dtype=torch.uint8)
@@ -83,6 +84,18 @@ def test_gate_features_decides_whether_the_network_has_a_gate(make):
     for gated in (True, False):
         network = make(8, gate_features=gated).q_network(spec, num_actions=4, num_conditions=2)
         assert (network.gate is not None) == gated
+
+
+@pytest.mark.parametrize("make", [compact_network, paper_network])
+def test_memory_span_reaches_the_memory_of_every_agent(make):
+    """Cells that remember for up to 50 steps have biases between 0 and log 49; PyTorch's are all below 0.2."""
+    env, architecture = small_env(2), make(hidden_size=32, memory_span=50)
+    for agent in (make_drqn(env, architecture), make_v3(env, architecture, memory_size=32)):
+        memories = [each for each in agent.policy.modules() if isinstance(each, nn.LSTM)]
+        assert memories
+        for memory in memories:
+            kept = (memory.bias_ih_l0 + memory.bias_hh_l0)[32:64]
+            assert kept.min() >= 0 and kept.max() > 3
 
 
 def test_each_network_has_its_own_weights():

@@ -7,7 +7,7 @@ from torch import nn
 
 from hdrqn_torchrl.devices import multiplies_bfloat16
 from hdrqn_torchrl.modules import lstm as lstm_module
-from hdrqn_torchrl.modules.lstm import Gaps, restarting_lstm
+from hdrqn_torchrl.modules.lstm import Gaps, remember_for, restarting_lstm
 
 
 def with_gaps(lstm, inputs, init, state):
@@ -176,3 +176,45 @@ class TestAutocast:
 
 def relative_error(found, expected):
     return ((found.float() - expected).norm() / expected.norm()).item()
+
+
+class TestMemorySpan:
+    @staticmethod
+    def left_after(lstm, steps):
+        """The share of a cell's gradient that is left after so many steps without inputs."""
+        zero = torch.zeros(1, lstm.hidden_size)
+        cell = torch.full_like(zero, 0.1).requires_grad_()
+        hidden, last = zero, cell
+        for _ in range(steps):
+            hidden, last = torch.lstm_cell(torch.zeros(1, 3), (hidden, last), *lstm_module.lstm_weights(lstm))
+        return torch.autograd.grad(last.sum(), cell)[0].abs().mean()
+
+    def test_new_cells_keep_things_for_about_so_many_steps(self):
+        torch.manual_seed(0)
+        lstm = nn.LSTM(3, 64, batch_first=True)
+        assert self.left_after(lstm, 20) < 1e-4
+        remember_for(lstm, 40)
+        assert self.left_after(lstm, 20) > 0.1 and self.left_after(lstm, 400) < 0.01
+
+    def test_forget_gates_are_open_for_1_to_span_steps_and_writing_gates_are_the_opposite(self):
+        lstm = nn.LSTM(3, 1000, batch_first=True)
+        others = {name: value.clone() for name, value in lstm.state_dict().items()}
+        remember_for(lstm, 50)
+        write, forget, *rest = (lstm.bias_ih_l0 + lstm.bias_hh_l0).chunk(4)
+        assert torch.equal(write, -forget)
+        spans = forget.exp()
+        assert 1 <= spans.min() < 2 and 48 < spans.max() <= 49 and abs(spans.mean() - 25) < 1.5
+        assert torch.equal(torch.cat(rest), (others["bias_ih_l0"] + others["bias_hh_l0"])[2000:])
+        assert torch.equal(lstm.weight_hh_l0, others["weight_hh_l0"])
+
+    def test_0_changes_nothing_and_draws_no_random_number(self):
+        lstm = nn.LSTM(3, 4, batch_first=True)
+        before, random = [each.clone() for each in lstm.parameters()], torch.get_rng_state()
+        remember_for(lstm, 0)
+        assert all(torch.equal(*pair) for pair in zip(before, lstm.parameters(), strict=True))
+        assert torch.equal(random, torch.get_rng_state())
+
+    @pytest.mark.parametrize("span", [-1, 1, 2, 2.5, True])
+    def test_a_span_that_can_not_be_is_refused(self, span):
+        with pytest.raises(ValueError, match=r"memory_span must be .* got"):
+            remember_for(nn.LSTM(3, 4), span)
