@@ -14,8 +14,8 @@ _POSITIONS = [0, 2]  # of cart and pole
 
 
 def positions(env: gymnasium.Env) -> gymnasium.Env:
-    """CartPole's two positions, without the two velocities between them."""
-    space = env.observation_space
-    assert isinstance(space, Box)
-    seen = Box(space.low[_POSITIONS], space.high[_POSITIONS], dtype=np.float32)
-    return TransformObservation(env, lambda observation: observation[_POSITIONS], seen)
+    """CartPole's two positions without the two velocities, in units of the limits at which an episode ends."""
+    world = env.unwrapped
+    limits = np.array([world.x_threshold, world.theta_threshold_radians], dtype=np.float32)
+    seen = Box(-2.0, 2.0, shape=(2,), dtype=np.float32)
+    return TransformObservation(env, lambda observation: observation[_POSITIONS] / limits, seen)

@@ -27,7 +27,7 @@ from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.saving import Saving
 from hdrqn_torchrl.runs.state_checks import rules_of
-from hdrqn_torchrl.runs.window import Window, check_counters, crossed
+from hdrqn_torchrl.runs.window import Window, check_counters, crossed, warn_of_clipping
 from hdrqn_torchrl.runs.workers import WorkersCollector
 
 
@@ -213,6 +213,7 @@ class Trainer:
             **self._window.summary(self.frames),
             **self.algorithm.figures(),
         }
+        warn_of_clipping(row, self.algorithm.learners)
         for monitor in self._reporting:
             row |= monitor.metrics()
         best = False

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from hdrqn_torchrl.learning import Learner
 from hdrqn_torchrl.runs.logging import Row
 
 _MOST = 2**53  # the largest count that a number in a table shows exactly
@@ -78,6 +81,27 @@ class Window:
 def crossed(before: int, after: int, interval: int) -> bool:
     """Whether a multiple of ``interval`` lies in (before, after]."""
     return before // interval < after // interval
+
+
+def warn_of_clipping(row: Row, learners: Mapping[str, Learner]) -> None:
+    """Warns of learners whose gradients are clipped in most updates.
+
+    Adam's steps do not depend on the scale of gradients, so clipping all of them slows nothing down. It shrinks those
+    the most that hold a rare surprise, such as the end of a long episode, which is then hardly learned from.
+
+    Args:
+        row: of a log point.
+        learners: by name.
+    """
+    for name, learner in learners.items():
+        norm = row.get(f"{name}/grad_norm")  # reported only where gradients are clipped
+        if isinstance(norm, float) and norm > (limit := learner.settings.max_grad_norm or math.inf):
+            warnings.warn(  # without the norm: the same text is shown once
+                f"max_grad_norm should be above the usual norm of gradients, got {limit} for {name!r}, where most are "
+                f"larger ({name}/grad_norm): rare surprises, such as the ends of long episodes, hardly count. Raise "
+                "it, or scale rewards to about 1.",
+                stacklevel=2,
+            )
 
 
 def check_counters(state: dict[str, Any]) -> None:

@@ -1,4 +1,5 @@
 import signal
+import warnings
 
 import pytest
 import torch
@@ -436,3 +437,17 @@ def test_updates_wait_until_there_is_a_sequence_to_draw(name, learner, tmp_path)
     trainer.train()
     for level in trainer.algorithm.learners.values():
         assert 8 <= level.updates <= 192 // 8
+
+
+class TestClipping:
+    @pytest.mark.parametrize(("limit", "warned"), [(1e-6, True), (100.0, False), (None, False)])
+    def test_a_training_warns_once_where_most_gradients_are_clipped(self, tmp_path, limit, warned):
+        trainer = make_training(
+            tmp_path, "drqn", learner={"max_grad_norm": limit}, total_frames=192, evaluation_frames=1000, log_frames=40
+        )
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            trainer.train()
+        told = [str(each.message) for each in caught if "max_grad_norm" in str(each.message)]
+        assert len(told) == warned
+        assert not warned or ("got 1e-06 for 'flat'" in told[0] and "flat/grad_norm" in told[0])
