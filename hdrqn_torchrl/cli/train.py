@@ -138,6 +138,7 @@ def tell_of_player(sentence: str) -> None:
 def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:
     """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
+    from hdrqn_torchrl.runs.facts import check_facts, facts_of, write_facts
     from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
 
     for name in layout.WRITTEN:
@@ -149,7 +150,10 @@ def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase,
     for path in stale:
         remove(path)
     trainer, evaluation_env, players = build_run(run, stop)
+    facts = facts_of(trainer.collector.env.base_env)
     if start is not None:
+        if not run.config.resume_override:
+            check_facts(run.folder, facts)
         trainer.resume(start)
     elif run.config.init_from is not None:
         path = find_weights(Path(run.config.init_from), run.config.init_checkpoint)
@@ -157,6 +161,7 @@ def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase,
         trainer.collector.update_policy_weights_()
         run = replace(run, weights=path)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
+    write_facts(run.folder, facts)
     for name in layout.AT_THE_END:
         remove(run.folder / name)
     return trainer, evaluation_env, players

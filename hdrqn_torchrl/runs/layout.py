@@ -8,6 +8,8 @@ CONFIG = "config.yaml"
 """Every setting, as values."""
 ORIGIN = "run.json"
 """Where the run comes from: command, choices of conf/, commit, versions."""
+TASK = "task.json"
+"""What the environment showed and stated when the run began: it goes on with no other."""
 METRICS = "metrics.csv"
 """One row per log point."""
 SUMMARY = "summary.json"
@@ -20,7 +22,7 @@ CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
 EVALUATIONS = "evaluations"
 """What ``evaluate.py out=RUN_DIR/evaluations/NAME.json`` writes."""
 
-WRITTEN = (CONFIG, ORIGIN, METRICS, ERROR, SUMMARY, CURVES)
+WRITTEN = (CONFIG, ORIGIN, TASK, METRICS, ERROR, SUMMARY, CURVES)
 """The files that a training writes."""
 AT_THE_END = (ERROR, SUMMARY, CURVES)
 """Those that are out of date as soon as it goes on."""
