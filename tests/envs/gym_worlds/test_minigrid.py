@@ -44,6 +44,15 @@ class TestSubgoals:
     def test_of_missions_to_go_somewhere_are_to_stand_before_objects(self):
         assert "stand before the red ball" in names("BabyAI-GoToLocal-v0")
 
+    def test_are_none_that_end_the_episode_or_that_the_actions_do_not_allow(self):
+        doors = names("MiniGrid-GoToDoor-8x8-v0")
+        assert doors == (*(f"stand before the {colour} door" for colour in COLOURS), "complete the mission")
+        assert not any(name.startswith("open") for name in names("MiniGrid-GoToObject-8x8-N2-v0"))
+        assert names("MiniGrid-Dynamic-Obstacles-6x6-v0") == ("reach the goal",)
+
+    def test_have_the_colours_that_occur(self):
+        assert names("MiniGrid-RedBlueDoors-6x6-v0")[:2] == ("open the red door", "open the blue door")
+
     def test_are_attained_on_the_bot_s_way_in_this_order(self):
         env = make_minigrid("BabyAI-KeyCorridorS3R3-v0", 1, seed=3)
         tensordict, attained = env.reset(), []
@@ -114,6 +123,15 @@ def test_a_process_looks_at_a_task_s_episodes_once_for_all_environments_with_the
     for _ in range(2):  # a list has no hash
         make_minigrid("BabyAI-BossLevel-v0", 1, settings={"action_kinds": ["goto"]})
     assert len(looks) == 5
+
+
+def test_a_task_with_fewer_actions_and_a_loss_states_both():
+    env = make_minigrid("MiniGrid-Dynamic-Obstacles-6x6-v0", 1)
+    assert env.action_spec.n == 3 and env.task.smallest_extrinsic_return == -1.0
+
+
+def test_a_task_without_a_mission_is_made():
+    assert make_minigrid("MiniGrid-Playground-v0", 1, seed=0).rollout(3).shape == (1, 3)
 
 
 def test_keeps_the_contract_of_tasks():

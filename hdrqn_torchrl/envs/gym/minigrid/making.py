@@ -33,6 +33,8 @@ WORDS = tuple(sorted(set(_VERBS)))
 _TASK = "a MiniGrid or BabyAI task"
 _USE_DONE = ("GoToDoor", "GoToObject")  # tasks whose end an agent has to declare
 
+_HURTS = "Dynamic-Obstacles"  # a collision pays -1
+
 
 def make_minigrid(
     id: str,
@@ -76,21 +78,22 @@ def make_minigrid(
     import_package_of(id)
     options = {**(settings or {}), **({} if max_steps is None else {"max_steps": max_steps})}
     found, can_play = _look(id, options)
+    chosen = _actions(id, found.num_actions) if actions is None else actions
     env = make_gym(
         id,
         num_envs,
-        subgoals=ObjectSubgoals(found) if subgoals == "objects" else subgoals,
+        subgoals=ObjectSubgoals(found, chosen) if subgoals == "objects" else subgoals,
         settings=options,
         entries=["image", "direction"] + (["mission"] if len(found.missions) > 1 else []),
         codes=CODES,
         words=WORDS,
-        text_length=max(len(mission.split()) for mission in found.missions),
-        actions=_actions(id) if actions is None else actions,
+        text_length=max(1, *(len(mission.split()) for mission in found.missions)),
+        actions=chosen,
         success=_succeeds,
         hazard=_fails if found.lava else None,
         max_steps=found.max_steps,
         largest_return=1.0,
-        smallest_return=0.0,
+        smallest_return=-1.0 if _HURTS in id else 0.0,
         processes=processes,
         seed=seed,
         device=device,
@@ -129,8 +132,8 @@ def _reference(make: Any, player: str, what: str, id: str, options: Mapping[str,
     return Reference(what=what, play=partial(play, make, player), key=key)
 
 
-def _actions(id: str) -> Sequence[int] | None:
-    return None if any(part in id for part in _USE_DONE) else range(6)
+def _actions(id: str, number: int) -> Sequence[int]:
+    return range(number) if any(part in id for part in _USE_DONE) else range(min(number, 6))
 
 
 def _succeeds(reward: float, info: Mapping[str, Any]) -> bool:

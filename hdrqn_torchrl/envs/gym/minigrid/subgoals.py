@@ -11,6 +11,8 @@ import numpy as np
 from hdrqn_torchrl.envs.gym.minigrid.survey import COLOURS, THINGS, Survey, cells_of, objects_of, rooms_of
 from hdrqn_torchrl.envs.gym.subgoals import Flags, Subgoals
 
+_PICKUP, _TOGGLE = 3, 5
+
 
 class Deed(NamedTuple):
     """Something that can be done with objects of a kind."""
@@ -33,10 +35,11 @@ class ObjectSubgoals(Subgoals):
 
     Args:
         found: what occurs in the task's episodes.
+        actions: numbers of the agent's actions; ``None``: all of the task's.
     """
 
-    def __init__(self, found: Survey) -> None:
-        self.deeds = tuple(deeds_of(found))
+    def __init__(self, found: Survey, actions: Sequence[int] | None = None) -> None:
+        self.deeds = tuple(deeds_of(found, range(found.num_actions) if actions is None else actions))
         self.names = tuple(str(deed) for deed in self.deeds)
         self.repeatable = tuple(deed.kind == "room" for deed in self.deeds)
         self._entered: set[int] = set()
@@ -89,15 +92,17 @@ class ObjectSubgoals(Subgoals):
         return bool(info.get("terminated")) and float(info.get("reward", 0.0)) > 0.0  # complete the mission
 
 
-def deeds_of(found: Survey) -> list[Deed]:
-    """The subgoals of a task."""
+def deeds_of(found: Survey, actions: Sequence[int]) -> list[Deed]:
+    """The subgoals of a task that an agent with these actions can attain without losing the episode."""
     deeds: list[Deed] = []
-    for kind in THINGS:
-        deeds += [Deed("pick up", kind, colour) for colour in _colours(found, kind)]
-    deeds += [Deed("open", "box")] if found.objects["box"] and "key" in found.objects else []
-    deeds += [Deed("unlock", "locked door")] if found.locked_doors else []
-    if found.objects["door"] > found.locked_doors:  # else to open it is to unlock it
-        deeds += [Deed("open", "door", colour) for colour in _colours(found, "door")]
+    if _PICKUP in actions:
+        for kind in THINGS:
+            deeds += [Deed("pick up", kind, colour) for colour in _colours(found, kind)]
+    if _TOGGLE in actions and not found.toggling_ends:
+        deeds += [Deed("open", "box")] if found.objects["box"] and "key" in found.objects else []
+        deeds += [Deed("unlock", "locked door")] if found.locked_doors else []
+        if found.objects["door"] > found.locked_doors:  # else to open it is to unlock it
+            deeds += [Deed("open", "door", colour) for colour in _colours(found, "door")]
     if found.goes_to:
         deeds += [Deed("stand before", kind, c) for kind in (*THINGS, "door") for c in _colours(found, kind)]
     deeds += [Deed("reach", "goal")] if found.objects["goal"] else []
@@ -106,8 +111,10 @@ def deeds_of(found: Survey) -> list[Deed]:
 
 
 def _colours(found: Survey, kind: str) -> tuple[str | None, ...]:
-    """Colours that tell a kind's objects apart: all, none is needed, or there are no objects."""
-    return () if not found.objects[kind] else COLOURS if kind in found.coloured else (None,)
+    """Colours that tell a kind's objects apart: those that occur, none is needed, or there are no objects."""
+    if not found.objects[kind]:
+        return ()
+    return tuple(each for each in COLOURS if each in found.colours[kind]) if kind in found.coloured else (None,)
 
 
 def _is(cell: Any, deed: Deed) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,6 +12,7 @@ import gymnasium
 COLOURS = ("red", "green", "blue", "purple", "yellow", "grey")
 THINGS = ("key", "ball", "box")
 _EPISODES = 50
+_TOGGLING_ENDS = ("GoToDoorEnv", "GoToObjectEnv")
 
 
 class Object(NamedTuple):
@@ -29,22 +30,28 @@ class Survey:
     Attributes:
         objects: the largest number of each kind of object in one episode.
         coloured: kinds of which one episode has several that differ in colour.
+        colours: of each kind, all that were met.
         locked_doors: whether doors are locked.
         rooms: whether there are several rooms whose extents are known.
         lava: whether there is lava.
         goes_to: whether missions ask to stand before an object.
         missions: all missions met.
         max_steps: the longest time limit met.
+        toggling_ends: whether to open something ends an episode without a reward.
+        num_actions: of the task.
     """
 
     objects: Counter[str]
     coloured: frozenset[str]
+    colours: Mapping[str, frozenset[str]]
     locked_doors: bool
     rooms: bool
     lava: bool
     goes_to: bool
     missions: frozenset[str]
     max_steps: int
+    toggling_ends: bool
+    num_actions: int
 
 
 def survey(env: gymnasium.Env, episodes: int = _EPISODES) -> Survey:
@@ -56,6 +63,7 @@ def survey(env: gymnasium.Env, episodes: int = _EPISODES) -> Survey:
     """
     most: Counter[str] = Counter()
     coloured, missions, max_steps = set(), set(), 0
+    colours: dict[str, set[str]] = {}
     locked = rooms = lava = goes_to = False
     for seed in range(episodes):
         env.reset(seed=seed)
@@ -64,15 +72,20 @@ def survey(env: gymnasium.Env, episodes: int = _EPISODES) -> Survey:
         numbers = Counter(each.kind for each in found)
         most |= numbers  # the larger of both
         coloured |= {each for each in numbers if len({one.colour for one in found if one.kind == each}) > 1}
+        for each in found:
+            colours.setdefault(each.kind, set()).add(each.colour)
         locked = locked or any(each.locked for each in found)
         rooms = rooms or len(rooms_of(world)) > 1
         lava = lava or any(cell.type == "lava" for cell in cells_of(world))
-        goes_to = goes_to or asks_to_go(getattr(world, "instrs", None))
+        goes_to = goes_to or asks_to_go(getattr(world, "instrs", None)) or world.mission.startswith("go to the ")
         missions.add(world.mission)
         max_steps = max(max_steps, int(world.max_steps))
     return Survey(
         objects=most, coloured=frozenset(coloured), locked_doors=locked, rooms=rooms, lava=lava, goes_to=goes_to,
         missions=frozenset(missions), max_steps=max_steps,
+        colours={kind: frozenset(found) for kind, found in colours.items()},
+        toggling_ends=type(env.unwrapped).__name__ in _TOGGLING_ENDS,
+        num_actions=int(env.action_space.n),  # type: ignore[attr-defined]
     )  # fmt: skip
 
 
