@@ -153,6 +153,13 @@ def _subgoals(entries: Entries, task: Task, number: int) -> tuple[SubgoalSet, ..
         entries.require_flags(each.keys.attained, len(each))
     if stated:
         return stated
+    if keys.ATTAINED not in entries:
+        shape = ", ".join(map(str, [*entries.batch_size, "G"]))
+        entries.problems.append(
+            f"{keys.ATTAINED!r} must be [{shape}] bool, it is missing: the task states no subgoals; "
+            "give make_gym some (env.subgoals=my_package.MySubgoals), or use a flat agent"
+        )
+        return ()
     entries.require_flags(keys.ATTAINED, None)
     size = entries.specs[keys.ATTAINED].shape[-1] if keys.ATTAINED in entries else 0
     return (SubgoalSet(names=tuple(f"subgoal {index}" for index in range(size))),) if size else ()

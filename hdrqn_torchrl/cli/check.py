@@ -38,7 +38,7 @@ def main() -> None:
         found = check_settings(composed(arguments))
     except ValueError as error:  # also of the environment's own parts, such as a critic
         sys.exit(f"error: {error}")
-    print("\n".join(found) or "nothing is wrong or missing")
+    print("\n".join(found))
     sys.exit(any(line.startswith("wrong") for line in found))
 
 
@@ -70,10 +70,13 @@ def composed(arguments: list[str]) -> RunSettings:
 
 
 def check_settings(settings: RunSettings) -> list[str]:
-    """Faults and gaps of the environment that the settings describe."""
+    """What an agent sees and does in the environment that the settings describe, then its faults and gaps."""
     from hdrqn_torchrl.envs import check_task  # takes seconds: it loads torch
+    from hdrqn_torchrl.runs.facts import facts_of
 
     changes = {"seed": settings.seed, "device": "cpu", "num_envs": WORLDS}
     env = build_env(settings, changes, settings.allowed_targets)
     network = build(settings.network, place="network", allowed=settings.allowed_targets)
-    return [str(finding) for finding in check_task(env, network_problem=network.observation_problem)]
+    seen = [f"{name}: {value}" for name, value in facts_of(env).items() if value]
+    found = [str(finding) for finding in check_task(env, network_problem=network.observation_problem)]
+    return [*seen, *(found or ["nothing is wrong or missing"])]

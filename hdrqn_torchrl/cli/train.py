@@ -25,7 +25,7 @@ from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build, build_algorithm, build_env
 from hdrqn_torchrl.runs.files import check_file, remove, replaced
-from hdrqn_torchrl.runs.settings import check, pick_device
+from hdrqn_torchrl.runs.settings import RunSettings, check, pick_device
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -64,7 +64,7 @@ def composed(config: DictConfig) -> float:
     except KeyboardInterrupt as stop:
         told = str(stop) or "stopped"
         if config.seeds is None:
-            told += f"; `{command(folder if run is None else run.folder, config.allowed_targets)}` goes on"
+            told += f"; `{goes_on(folder, config) if run is None else goes_on(run.folder, run.config)}` goes on"
         print(told, file=sys.stderr)
         sweeps.end_stopped_job(getattr(stop, "exit_code", 130))
     except Exception as error:
@@ -73,6 +73,12 @@ def composed(config: DictConfig) -> float:
         if sweeps.is_sweep() or not isinstance(error, (SettingsError, RunError)):
             raise
         sys.exit(f"error: {error}")
+
+
+def goes_on(folder: Path, config: DictConfig | RunSettings) -> str:
+    """The command that resumes a run, with all that it must allow: what the user's own command named."""
+    settings = resolved(config) if isinstance(config, DictConfig) else config
+    return command(folder, settings.allowed_targets)
 
 
 def train(run: Plan) -> float:

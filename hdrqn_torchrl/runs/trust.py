@@ -92,17 +92,19 @@ def check_targets(settings: Any, allowed: Sequence[str], place: str = "") -> Non
         raise SettingsError(str(error)) from error
     for path, node in _nodes(settings, place):
         target = node.get(TARGET)
+        unknown = [name for name in imports_of(node) if name not in allowed]
+        needed = ",".join([*allowed, str(target)])
         if TARGET in node and target not in (*_builders_at(path), *allowed):
             raise SettingsError(
                 f"{path}._target_ must be one of the builders that this program trusts there, got {target!r}. If you "
-                f"wrote this setting and trust it, add 'allowed_targets=[{target}]' to the command."
+                f"wrote this setting and trust it, add 'allowed_targets=[{needed}]' to the command."
             )
-        for name in imports_of(node):
-            if name not in allowed:
-                raise SettingsError(
-                    f"{path} must import nothing that this program does not trust, got {name!r}. If you wrote this "
-                    f"setting and trust it, add 'allowed_targets=[{name}]' to the command."
-                )
+        if unknown:
+            raise SettingsError(
+                f"{path} must import nothing that this program does not trust, got {', '.join(map(repr, unknown))}. If "
+                "you wrote these settings and trust them, add "
+                f"'allowed_targets=[{','.join([*allowed, *unknown])}]' to the command."
+            )
         for key in node:
             may = (target in allowed or _LOGGER.fullmatch(path)) and node[key] in _MARKS.get(key, ())
             if key.startswith("_") and key != TARGET and not may:

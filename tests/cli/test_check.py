@@ -26,7 +26,9 @@ def run(monkeypatch, capsys, tmp_path):
 
 
 def test_a_task_of_the_package_has_no_fault_and_no_folder_is_made(run, tmp_path):
-    assert run("env=gridworld") == (0, "nothing is wrong or missing\n")
+    code, printed = run("env=gridworld")
+    assert code == 0 and printed.endswith("\nnothing is wrong or missing\n")
+    assert "action: int64 [] below 4" in printed and "names of subgoals: goal 1" in printed
     assert not list(tmp_path.iterdir())
 
 
@@ -34,7 +36,8 @@ def test_a_task_of_the_package_has_no_fault_and_no_folder_is_made(run, tmp_path)
 def test_an_environment_of_a_users_configuration_folder_is_checked_wherever_the_folder_is_named(run, tmp_path, option):
     (tmp_path / "my conf" / "env").mkdir(parents=True)
     (tmp_path / "my conf" / "env" / "small.yaml").write_text("defaults:\n  - gridworld\n  - _self_\nmax_steps: 5\n")
-    assert run("env=small", *option, "env.max_steps=6") == (0, "nothing is wrong or missing\n")
+    code, printed = run("env=small", *option, "env.max_steps=6")
+    assert code == 0 and "longest episode: 6" in printed and printed.endswith("\nnothing is wrong or missing\n")
 
 
 def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
@@ -46,7 +49,7 @@ def test_an_observation_that_the_network_can_not_read_gives_exit_code_1(run, mon
     env = Corridor(4, odd={"observation": Unbounded((4, 3), dtype=torch.float64)})
     monkeypatch.setattr("hdrqn_torchrl.cli.check.build_env", lambda *_: env)
     code, told = run("env=gridworld")
-    assert code == 1 and told.startswith("wrong: 'observation' is not a square of cell codes")
+    assert code == 1 and "\nwrong: 'observation' is not a square of cell codes" in told
 
 
 def test_an_error_of_a_part_of_the_environment_is_told_without_a_traceback(run, monkeypatch):

@@ -52,7 +52,7 @@ class TestCheckTargets:
 
     def test_a_users_builders_can_be_added(self, settings):
         settings.env._target_ = "my_package.MyEnv"
-        with pytest.raises(SettingsError, match=r"add 'allowed_targets=\[my_package\.MyEnv\]' to the command"):
+        with pytest.raises(SettingsError, match=r"add 'allowed_targets=\[my_package\.Other,my_package\.MyEnv\]' to"):
             check_targets(plain(settings), ["my_package.Other"])
         check_targets(plain(settings), ["my_package.MyEnv"])
         settings.allowed_targets = ["my_package.MyEnv"]
@@ -61,3 +61,11 @@ class TestCheckTargets:
 
 def test_packages_that_make_gym_knows_may_be_imported():
     assert set(KNOWN_PACKAGES) == set(PACKAGES.values())
+
+
+def test_all_names_that_an_environment_imports_are_asked_for_at_once_with_those_that_are_allowed():
+    env = {"_target_": "hdrqn_torchrl.envs.make_gym", "id": "Maze-v0", "subgoals": "mine.Doors", "package": "mazes"}
+    with pytest.raises(
+        SettingsError, match=r"got 'mine\.Doors', 'mazes'.*'allowed_targets=\[a\.B,mine\.Doors,mazes\]'"
+    ):
+        check_targets(env, ["a.B"], "env")
