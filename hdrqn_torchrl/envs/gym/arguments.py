@@ -9,10 +9,13 @@ from enum import IntEnum
 from typing import Any
 
 import gymnasium
+import numpy as np
 from gymnasium import spaces
 
+from hdrqn_torchrl.envs.gym.given import check_rule
 from hdrqn_torchrl.envs.gym.subgoals import Subgoals
 from hdrqn_torchrl.envs.gym.worlds import Rule
+from hdrqn_torchrl.envs.subgoals import check_names
 
 PACKAGES = {
     "ALE/": "ale_py",
@@ -64,15 +67,29 @@ def subgoals_of(given: SomeSubgoals) -> tuple[Subgoals, ...]:
                 f"subgoals must have names and a method conditions, got {each!r}; derive a class from "
                 "hdrqn_torchrl.envs.gym.Subgoals."
             )
+        _check_set(each)
     prefixes = [each.prefix for each in made]
     if made and (len(set(prefixes)) < len(made) or prefixes[-1]):
         raise ValueError(f"subgoals must have different prefixes, and the last, farthest set none, got {prefixes}.")
     return made
 
 
+def _check_set(subgoals: Subgoals) -> None:
+    """Refuses names, and answers about repetition, that are not one for each subgoal."""
+    names = check_names("subgoals.names", subgoals.names)
+    answers = np.asarray(subgoals.repeatable)
+    if answers.dtype != np.bool_ or answers.shape not in ((), (len(names),)):
+        raise ValueError(
+            f"subgoals.repeatable must be True or False, or a list of them for the names {list(names)}, got "
+            f"{subgoals.repeatable!r}."
+        )
+
+
 def rule_of(name: str, rule: str | Rule | None) -> str | Rule | None:
     """A function, or the name of an entry of ``info``; names with dots are those of functions."""
-    return _named(name, rule) if isinstance(rule, str) and "." in rule else rule
+    found = _named(name, rule) if isinstance(rule, str) and "." in rule else rule
+    check_rule(name, found)
+    return found
 
 
 def wrappers_of(given: Sequence[Callable[[gymnasium.Env], gymnasium.Env] | str]) -> list[Callable]:
@@ -128,7 +145,8 @@ def import_package_of(id: str, package: str | None = None) -> None:
     Raises:
         ImportError: if it is missing.
     """
-    known = [each for start, each in PACKAGES.items() if id.startswith(start)]
+    module = id.partition(":")[0]  # of "module:Name-v0", which Gymnasium imports, too
+    known = [module] if module != id else [each for start, each in PACKAGES.items() if id.startswith(start)]
     for name in [package] if package else known:
         try:
             gymnasium.register_envs(importlib.import_module(name))

@@ -28,7 +28,9 @@ from hdrqn_torchrl.envs.gym.arguments import (
     wrappers_of,
 )
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
+from hdrqn_torchrl.envs.gym.given import check_given, checked_world, wrapped
 from hdrqn_torchrl.envs.gym.observations import Channels, make_encoder
+from hdrqn_torchrl.envs.gym.returned import begun
 from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
 from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper
 from hdrqn_torchrl.envs.task import Task
@@ -102,8 +104,9 @@ def make_gym(
         >>> env.rollout(3)["observation"].shape
         torch.Size([4, 3, 4])
     """
-    if isinstance(num_envs, bool) or num_envs < 1:
-        raise ValueError(f"num_envs must be >= 1, got {num_envs}; use 16 for training on one core.")
+    check_given(
+        id, num_envs, settings=settings, package=package, wrappers=wrappers, actions=actions, max_steps=max_steps
+    )
     read = partial(
         _read,
         actions=actions,
@@ -179,7 +182,7 @@ def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, p
     """A vector of worlds that are made here."""
     probe = make()
     try:
-        _, info = probe.reset(seed=0)
+        _, info = begun(probe, seed=0)
         reading, actions = read(probe.observation_space, probe.action_space, masked=keys.ACTION_MASK in info)
         names, limit = action_names_of(probe, actions), _time_limit(probe)
         modes = probe.metadata.get("render_modes") or ()
@@ -235,14 +238,14 @@ def _registered(id: str, settings: Mapping[str, Any], max_steps: int | None, **m
 
 
 def _limited(make: EnvFactory, max_steps: int | None, **_: Any) -> gymnasium.Env:
-    env = make()
+    env = checked_world(make(), "id, a function,", "one that")
     return env if max_steps is None else TimeLimit(env, max_steps)
 
 
 def _wrapped(make: Callable[..., gymnasium.Env], wrappers: Iterable[Callable], **settings: Any) -> gymnasium.Env:
     env = make(**settings)
     for wrapper in wrappers:
-        env = wrapper(env)
+        env = wrapped(env, wrapper)
     return env
 
 
@@ -281,8 +284,6 @@ def _pool(id: str, num_envs: int, settings: Mapping[str, Any], seed: int) -> Any
 
 
 def _limit(max_steps: int | None) -> dict[str, Any]:
-    if max_steps is not None and max_steps < 1:
-        raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None: the environment's own limit.")
     return {} if max_steps is None else {"max_episode_steps": max_steps}
 
 

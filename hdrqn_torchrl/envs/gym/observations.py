@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.gym.codes import as_codes, code_of, codes_of, codes_of_box, codes_of_words
 from hdrqn_torchrl.envs.gym.encoder import Encoder
+from hdrqn_torchrl.envs.gym.given import check_list, check_whole_number
 from hdrqn_torchrl.envs.gym.returned import array_of, check_whole, part_of
 from hdrqn_torchrl.envs.observations import LARGEST_FLOAT, MOST_COLOURS
 
@@ -66,8 +67,9 @@ def make_encoder(
         >>> make_encoder(spaces.Text(20), words=("go", "left"), text_length=3).encode("go far left")
         array([1, 0, 2], dtype=uint8)
     """
-    if text_length < 1:
-        raise ValueError(f"text_length must be >= 1, got {text_length}; 16 words are usual.")
+    check_whole_number("text_length", text_length, remedy="16 words are usual")
+    check_list("words", words, str, "words")
+    check_list("entries", entries, str, "names of entries")
     if channels not in (None, "first", "last"):
         raise ValueError(f"channels must be 'first', 'last' or None, got {channels!r}.")
     parts: list[tuple[Any, spaces.Space]]
@@ -82,9 +84,20 @@ def make_encoder(
     elif isinstance(space, spaces.Tuple):
         parts = list(enumerate(space.spaces))
     else:
+        _check_used(space, channels, codes, name)
         return _encoder_of(space, channels, codes, words, text_length, name)
     make = partial(make_encoder, channels=channels, codes=codes, words=words, text_length=text_length)
     return _joined({key: make(part, name=f"{name}[{key!r}]") for key, part in parts}, name)
+
+
+def _check_used(space: spaces.Space, channels: Channels | None, codes: object, name: str) -> None:
+    """Refuses options that a single observation does not use."""
+    if name != keys.OBSERVATION:  # one of several, of which others may use them
+        return
+    if codes is not None and not (isinstance(space, spaces.Box) and space.dtype.kind in "iu"):
+        raise ValueError(f"codes must be None for observations that are no Box of integers, got {codes} for {space}.")
+    if channels is not None and not (isinstance(space, spaces.Box) and len(space.shape) == 3):
+        raise ValueError(f"channels must be None for observations that are no image, got {channels!r} for {space}.")
 
 
 def _encoder_of(
@@ -102,7 +115,8 @@ def _encoder_of(
         return codes_of(np.array(space.nvec), np.asarray(space.start), name)
     if isinstance(space, spaces.MultiBinary):
         return codes_of(np.full(space.shape, 2), np.zeros(space.shape, np.int64), name)
-    if isinstance(space, spaces.Text) or (space.dtype is not None and space.dtype.kind == "U"):  # MiniGrid's missions
+    kind = space.dtype.kind if isinstance(space, spaces.Space) and space.dtype is not None else None
+    if isinstance(space, spaces.Text) or kind == "U":  # MiniGrid's missions
         return codes_of_words(words, text_length, name)
     if isinstance(space, spaces.Box):
         if codes is None or space.dtype.kind not in "iu":
@@ -115,6 +129,8 @@ def _encoder_of(
 
 
 def _box(space: spaces.Box, channels: Channels | None, name: str) -> Encoder:
+    if not np.prod(space.shape):
+        raise ValueError(f"{name} must have at least one entry, got {space}; leave it out (entries=[...]).")
     shape, is_byte = space.shape, space.dtype == np.uint8
     about_one = bool(np.isfinite(space.high).all() and space.high.max() <= LARGEST_FLOAT)
     if len(shape) == 2 and is_byte:

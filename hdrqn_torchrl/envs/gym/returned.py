@@ -179,3 +179,18 @@ def check_readable(error: Exception, method: str) -> None:
     if isinstance(error, ReturnError) or not last.filename.startswith(_READERS):
         return
     raise ReturnError(f"{method} must return {_RETURNED[method]} as the environment's spaces say: {error}") from error
+
+
+def begun(env: gymnasium.Env, *, seed: int | None, options: dict[str, Any] | None = None) -> tuple[Any, Mapping]:
+    """What an environment's ``reset`` returns: an observation and info.
+
+    Raises:
+        ReturnError: if it returns something else.
+    """
+    try:
+        returned = env.reset(seed=seed, options=options)
+    except (ValueError, TypeError, AssertionError) as error:
+        check_readable(error, "reset")
+        raise
+    observation, info = parts_of(returned, "reset")
+    return observation, info_of(info, "reset")

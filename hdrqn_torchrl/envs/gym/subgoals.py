@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from hdrqn_torchrl.envs.findings import ReturnError
 from hdrqn_torchrl.envs.gym.returned import truths_of
 from hdrqn_torchrl.envs.task import SubgoalSet
 
@@ -88,6 +89,7 @@ class SubgoalRecord:
         self.subgoals, self.env = deepcopy(subgoals), env
         self._held = self._attained = np.zeros(len(subgoals.names), np.bool_)
         self._keys = subgoals.stated.keys
+        self._steps = 0  # since the episode began, or was brought back
         self._rules = {
             method: f"what subgoals.{method} returns, one for each of the names {list(subgoals.names)},"
             for method in ("conditions", "available")
@@ -115,11 +117,30 @@ class SubgoalRecord:
         self._held, self._attained = (np.asarray(state[name], np.bool_) for name in ("held", "attained"))
 
     def _conditions(self, before: Any, after: Any, info: Mapping[str, Any]) -> Flags:
-        return self._flags("conditions", self.subgoals.conditions(self.env, before, after, info))
+        self._steps = 0 if before is None else self._steps + 1
+        try:
+            found = self.subgoals.conditions(self.env, before, after, info)
+        except Exception as error:
+            raise self._failure("conditions", error) from error
+        return self._flags("conditions", found)
 
     def _entries(self, attained: Flags) -> dict[str, Flags]:
-        available = self._flags("available", self.subgoals.available(self.env, self._attained))
+        try:
+            found = self.subgoals.available(self.env, self._attained)
+        except Exception as error:
+            raise self._failure("available", error) from error
+        available = self._flags("available", found)
         return {self._keys.attained: attained, self._keys.available: available}
+
+    def _failure(self, method: str, error: Exception) -> ReturnError:
+        """What to say of an error in a user's own method."""
+        blind = self.env is None and isinstance(error, AttributeError)
+        remedy = "; env is None for EnvPool and for vectors made elsewhere: use before, after and info" * blind
+        own = f"{type(self.subgoals).__name__} ({', '.join(self.subgoals.names)})"
+        return ReturnError(
+            f"subgoals.{method} of {own} must not fail, got {type(error).__name__}: {error}, {self._steps} steps into "
+            f"an episode{remedy}."
+        )
 
     def _flags(self, method: str, found: Sequence[bool] | Flags) -> Flags:
         return truths_of(found, len(self._held), self._rules[method])

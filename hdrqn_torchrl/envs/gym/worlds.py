@@ -18,6 +18,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.findings import ReturnError
 from hdrqn_torchrl.envs.gym.encoder import Encoder
 from hdrqn_torchrl.envs.gym.returned import (
+    begun,
     check_readable,
     info_of,
     number_of,
@@ -188,12 +189,7 @@ class WorldWrapper(gymnasium.Wrapper):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Entries, dict[str, Any]]:
         """A new episode; see :class:`gymnasium.Env`."""
-        try:
-            returned = self.env.reset(seed=seed, options=options)
-        except (ValueError, TypeError, AssertionError) as error:
-            check_readable(error, "reset")
-            raise
-        observation, info = parts_of(returned, "reset")
+        observation, info = begun(self.env, seed=seed, options=options)
         self._seed, self._actions = seed, []
         self.entries = self.world.begin(observation, info)
         return self.entries, {}

@@ -11,7 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from hdrqn_torchrl.envs import check_task, make_gym
-from hdrqn_torchrl.envs.gym import make_encoder
+from hdrqn_torchrl.envs.gym import Subgoals, make_encoder
 
 
 class Odd(gymnasium.Env):
@@ -163,6 +163,80 @@ class TestObservations:
 
         with np.errstate(over="ignore"):
             refused(re.escape("observation['b'][1] of world 0 must be a finite number as float32"), make_gym(make, 2))
+
+
+NOTHING = np.zeros(2, np.float32)
+
+
+class TestSteps:
+    @pytest.mark.parametrize(
+        ("odd", "words"),
+        [
+            ({"reward": None}, "reward must be a finite number, got None"),
+            ({"reward": "1.0"}, "reward must be a finite number, got '1.0'"),
+            ({"reward": np.zeros(2)}, r"reward must be a finite number, got float64 \[2\]"),
+            ({"reward": float("nan")}, "reward must be a finite number, got nan"),
+            ({"terminated": None}, "terminated must be True or False"),
+            ({"info": None}, r"step must return \(observation, .* with a dictionary as info, got None"),
+            (
+                {"step": (NOTHING, 0.0, False, {})},
+                r"step must return \(observation, reward, terminated, ",
+            ),
+            ({"reset": NOTHING}, r"reset must return \(observation, info\)"),
+            ({"reset": (NOTHING, None)}, r"reset must return \(observation, info\) with a dictionary"),
+        ],
+    )
+    @pytest.mark.parametrize("max_steps", [None, 9], ids=["bare", "limited"])
+    def test_against_the_rules_of_gymnasium_are_refused(self, odd, words, max_steps):
+        with pytest.raises(ValueError, match=words):
+            make_gym(lambda: Odd(**odd), 2, max_steps=max_steps).rollout(3)
+
+    def test_may_pay_a_reward_in_an_array_of_one_number(self):
+        env = make_gym(lambda: Odd(reward=np.array([0.5], np.float32), terminated=np.array([True])), 2)
+        step = env.rollout(3, break_when_any_done=False)["next"]
+        assert step["reward"][:, 1].tolist() == [[0.5]] * 2 and step["terminated"][:, 1].all()
+
+    @pytest.mark.parametrize("name", ["success", "hazard"])
+    @pytest.mark.parametrize("verdict", ["no", None, float("nan"), np.array([True, False]), 2])
+    def test_have_verdicts_that_are_true_or_false(self, verdict, name):
+        env = make_gym(lambda: Odd(at_reset={"x": verdict}), 2, **{name: "x"})
+        refused(f"{name} must be True or False", env)
+
+    def test_get_a_number_from_a_rule_for_the_reward(self):
+        refused("reward must be a finite number, got None", make_gym(Odd, 2, reward=lambda reward, info: None))
+
+
+def made_with(conditions, id=Odd, **odd):
+    own = {"names": ("a", "b"), "conditions": lambda self, *given: conditions(*given), **odd}
+    return make_gym(id, 2, subgoals=type("Own", (Subgoals,), own)())
+
+
+class TestSubgoals:
+    @pytest.mark.parametrize(
+        "holds", [("no", "no"), (float("nan"), 0), (2, 3), None, True, (True,), {"a": True, "b": True}]
+    )
+    def test_have_conditions_that_are_true_or_false(self, holds):
+        refused("what subgoals.conditions returns, one for each", made_with(lambda *_: holds))
+
+    def test_that_fail_are_named_with_the_step(self):
+        def fail(env, before, after, info):
+            if env.unwrapped.steps == 2:
+                raise KeyError("door")
+            return True, False
+
+        words = r"subgoals.conditions of Own \(a, b\) must not fail, got KeyError: 'door', 2 steps into an episode"
+        refused(words, made_with(fail))
+
+    def test_that_look_into_worlds_which_can_not_be_looked_into_are_told_so(self):
+        vector = SyncVectorEnv([Counter] * 2, autoreset_mode=AutoresetMode.DISABLED)
+        refused("must not fail, .*; env is None for EnvPool", made_with(lambda env, *_: env.unwrapped, vector))
+
+    @pytest.mark.parametrize(
+        "odd", [{"names": "ab"}, {"names": ("a", "a")}, {"repeatable": (True,)}, {"repeatable": "no"}]
+    )
+    def test_with_other_names_or_answers_are_refused(self, odd):
+        with pytest.raises(ValueError, match=f"subgoals.{next(iter(odd))} must be"):
+            made_with(lambda *_: (True, True), **odd)
 
 
 def test_the_check_of_a_task_says_what_is_returned_wrongly():
