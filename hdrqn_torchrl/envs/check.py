@@ -16,7 +16,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
-from hdrqn_torchrl.envs.check_choices import check_masks, check_observation, random_actions
+from hdrqn_torchrl.envs.check_choices import check_masks, check_observation, check_shapes, check_values, random_actions
 from hdrqn_torchrl.envs.findings import Finding, ReturnError, missing, wrong
 from hdrqn_torchrl.envs.observations import ProblemOf
 from hdrqn_torchrl.envs.specs import check_is_environment
@@ -154,7 +154,9 @@ def _other_statement(env: EnvBase) -> object:
 def _behaviour(env: EnvBase, task: Task, steps: int, seed: int) -> list[Finding]:
     """Faults that show when it is stepped."""
     first, again, other = (_rollout(env, steps, each, seed) for each in (seed, seed, seed + 1))
-    found = list(_shapes(env, first[0]))
+    found = list(check_shapes(env, first[0])) or list(
+        check_values(first + other, env.observation_spec[keys.OBSERVATION])
+    )
     if found:
         return found
     for rollout in (first, other):
@@ -177,19 +179,6 @@ def _go_on(env: EnvBase, tensordict: TensorDictBase, steps: int) -> Rollout:
         step, tensordict = env.step_and_maybe_reset(random_actions(env, tensordict))
         rollout.append(step.clone())
     return rollout
-
-
-def _shapes(env: EnvBase, step: TensorDictBase) -> Iterator[Finding]:
-    """Whether the entries are as the specs promise."""
-    specs = {**dict(env.observation_spec.items(True, True)), **dict(env.full_reward_spec.items(True, True))}
-    specs |= dict(env.full_done_spec.items(True, True))
-    for key, spec in specs.items():
-        value = step["next"].get(key, None)
-        if value is None:
-            yield wrong(f"{key!r} has a spec, but is not written", "agents that read it fail")
-        elif (value.shape, value.dtype) != (spec.shape, spec.dtype):
-            text = f"{key!r} must be {spec.dtype} {list(spec.shape)} as its spec says, got {value.dtype} "
-            yield wrong(text + f"{list(value.shape)}", "agents that read it fail")
 
 
 def _column(rollout: Rollout, key: str) -> Tensor:

@@ -1,11 +1,13 @@
-"""What the check of an environment says about the observation, and about actions that can't always be chosen."""
+"""What the check of an environment says about single entries: shapes, the observation, and actions to choose from."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 
 import torch
 from tensordict import TensorDictBase
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
@@ -33,6 +35,37 @@ def check_observation(env: EnvBase, network_problem: ProblemOf | None = None) ->
         if largest <= _BYTE and size > 1:
             text = f"{keys.OBSERVATION!r} holds codes below {largest} as {spec.dtype}, and not as uint8"
             yield missing(text, f"replay memories are {size} times as large")
+
+
+def check_shapes(env: EnvBase, step: TensorDictBase) -> Iterator[Finding]:
+    """Whether the entries are as the specs promise."""
+    specs = {**dict(env.observation_spec.items(True, True)), **dict(env.full_reward_spec.items(True, True))}
+    specs |= dict(env.full_done_spec.items(True, True))
+    for key, spec in specs.items():
+        value = step["next"].get(key, None)
+        if value is None:
+            yield wrong(f"{key!r} has a spec, but is not written", "agents that read it fail")
+        elif (value.shape, value.dtype) != (spec.shape, spec.dtype):
+            text = f"{key!r} must be {spec.dtype} {list(spec.shape)} as its spec says, got {value.dtype} "
+            yield wrong(text + f"{list(value.shape)}", "agents that read it fail")
+
+
+def check_values(rollout: Sequence[TensorDictBase], spec: TensorSpec, batch_dims: int = 1) -> Iterator[Finding]:
+    """Whether observations are numbers, and codes below the numbers of them that their spec states."""
+    values = torch.stack([each[keys.OBSERVATION] for step in rollout for each in (step, step["next"])])
+    if values.is_floating_point() and not values.isfinite().all():
+        yield wrong(f"{keys.OBSERVATION!r} must be finite numbers, and is not", "training stops")
+        return
+    shape = spec.shape[batch_dims:]
+    if observation_kind(spec, shape) not in ("cells", "codes"):
+        return
+    codes = values.reshape(-1, math.prod(shape)).long().cpu()
+    outside = (codes < 0) | (codes >= torch.tensor(code_sizes(spec, shape)))
+    if outside.any():
+        place = int(outside.any(0).nonzero()[0])
+        size, worst = code_sizes(spec, shape)[place], int(codes[:, place][outside[:, place]][0])
+        text = f"{keys.OBSERVATION!r} must be codes below {size} at entry {place} as its spec says, got {worst}"
+        yield wrong(text, "a code is taken for another one's")
 
 
 def random_actions(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:

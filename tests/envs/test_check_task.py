@@ -172,6 +172,36 @@ def test_a_fault_is_found_and_named(env, fault):
     assert any(re.match(fault, each) for each in found), found
 
 
+class Unseeing(Corridor):
+    """Shows no number."""
+
+    shown = float("nan")
+
+    def _written(self, moved, *specs):
+        after = super()._written(moved, *specs)
+        return after.set("observation", torch.full_like(after["observation"], self.shown))
+
+
+class Overflowing(Unseeing):
+    """Shows a code that there is not."""
+
+    shown = 7
+
+
+@pytest.mark.parametrize(
+    ("env", "fault"),
+    [
+        (
+            corridor(Unseeing, odd={"observation": Unbounded((4, 3))}),
+            "'observation' must be finite numbers, and is not",
+        ),
+        (corridor(Overflowing), "'observation' must be codes below 5 at entry 0 as its spec says, got 7"),
+    ],
+)
+def test_values_that_are_no_numbers_or_no_codes_are_the_only_fault_that_is_told(env, fault):
+    assert wrong(env) == [fault]
+
+
 @pytest.mark.parametrize(
     "env, costs",
     [
