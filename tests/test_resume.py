@@ -222,7 +222,7 @@ def test_a_stopped_and_resumed_training_equals_an_uninterrupted_one(training, na
     build, folder = training
     shutil.copytree(folder / name, tmp_path, dirs_exist_ok=True)
     trainer = resume(build, tmp_path)
-    Checkpoints(tmp_path / "again" / "checkpoints").save(trainer._components(), step=trainer.frames)
+    Checkpoints(tmp_path / "again" / "checkpoints").save(trainer._parts(), step=trainer.frames)
     check_same_checkpoint(tmp_path / "again", folder / name)  # everything that was saved was restored
     trainer.train()
     check_same(tmp_path, folder / "uninterrupted")
@@ -329,7 +329,7 @@ def test_a_checkpoint_without_memories_resumes_with_empty_ones(training, tmp_pat
     trainer = resume(build, tmp_path, checkpoints=Checkpoints(tmp_path / "checkpoints", replay=False))
     frames, updates, expected = trainer.frames, trainer.updates, trainer.algorithm.policy.state_dict()
     expected = {key: value.clone() for key, value in expected.items()}
-    trainer._saved_position = None
+    trainer._saving._saved = ()
     trainer.save()
     trainer = resume(build, tmp_path, total_frames=frames + 160)
     assert "holds no replay memory: it begins empty and is warmed up again" in trainer.logger.console.file.getvalue()
