@@ -23,7 +23,7 @@ from hdrqn_torchrl.modules.features import (
 from hdrqn_torchrl.modules.prediction import ObservationPredictor
 from hdrqn_torchrl.modules.q_network import QNetwork
 from hdrqn_torchrl.modules.scaled_vector import ScaledVector
-from hdrqn_torchrl.modules.sizes import check_size, check_widths
+from hdrqn_torchrl.modules.sizes import check_memory_span, check_size, check_widths
 
 _COARSE = 14  # side of predicted images in pixels
 
@@ -51,6 +51,7 @@ class Architecture:
 
     def __post_init__(self) -> None:
         check_size("hidden_size", self.hidden_size, "64, or the paper's 256")
+        check_memory_span(self.memory_span)
 
     def features(self, inputs: TensorSpec | int) -> Features:
         """The feature extractor for an observation spec or a vector of a given size, tried once.

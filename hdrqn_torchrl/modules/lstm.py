@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from hdrqn_torchrl.devices import autocast_dtype, multiplies_bfloat16, on_host
-from hdrqn_torchrl.modules.sizes import check_size
+from hdrqn_torchrl.modules.sizes import check_memory_span
 
 CLOSED = -1e4
 """Gate input at a gap; its sigmoid is zero in every floating-point format."""
@@ -118,10 +118,9 @@ def remember_for(lstm: nn.LSTM, steps: int) -> None:
         >>> bool((lstm_weights(lstm)[2][2:4].sigmoid() >= 0.5).all())
         True
     """
-    check_size("memory_span", steps, "the steps between a hint and its use, or 0 for PyTorch's own biases", least=0)
+    check_memory_span(steps)
     if steps == 0:
         return
-    check_size("memory_span", steps, "the steps between a hint and its use, or 0 for PyTorch's own biases", least=3)
     _, _, bias_ih, bias_hh = lstm_weights(lstm)
     size = lstm.hidden_size
     with torch.no_grad():

@@ -30,6 +30,16 @@ def check_size(name: str, size: int, usual: int | str, *, least: int = 1) -> Non
         raise ValueError(f"{name} must be >= {least}, got {size}; use {usual}.")
 
 
+def check_memory_span(steps: int) -> None:
+    """Checks the steps that a new memory keeps things for (:func:`~hdrqn_torchrl.modules.lstm.remember_for`).
+
+    Raises:
+        ValueError: if they are neither 0 nor a whole number of at least 3.
+    """
+    usual = "the steps between a hint and its use, or 0 for PyTorch's own biases"
+    check_size("memory_span", steps, usual, least=0 if steps == 0 else 3)
+
+
 def check_widths(widths: Sequence[int], name: str = "widths") -> tuple[int, ...]:
     """Checks the sizes of several layers, and returns them as a tuple.
 
