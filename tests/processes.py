@@ -146,6 +146,6 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
 
     begin, train.build_run, train.begin = train.begin, build_run, noted_begin
     train.record, train.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
-    config: Any = SimpleNamespace(threads=1, init_from=None, allowed_targets=[])
+    config: Any = SimpleNamespace(threads=1, init_from=None, allowed_targets=[], resume_override=False)
     train.train(Plan(folder, config, {}, resumed=True))
     diary.note("done")

@@ -78,11 +78,14 @@ class Trainer:
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
         self._tracker = EpisodeTracker(algorithm.task)
         self._window = Window()
-        workers = [collector] if isinstance(collector, WorkersCollector) else []
-        self._reporting: list[Monitor | WorkersCollector] = [*algorithm.monitors.values(), *workers]
         self._stop = stop or StopRequest()
         self._started = time.monotonic()
         self._saving = Saving(checkpoints, self._parts, place=lambda: self._place, seconds=checkpoint_seconds)
+
+    @property
+    def _reporting(self) -> list[Monitor | WorkersCollector]:
+        workers = [self.collector] if isinstance(self.collector, WorkersCollector) else []
+        return [*self.algorithm.monitors.values(), *workers]
 
     @property
     def wall_seconds(self) -> float:
@@ -230,14 +233,10 @@ class Trainer:
             if best:
                 self.best_return = result["return_mean"]
             self.logger.log(row)
-            self._begin_row()
+            self._window = Window(self.frames)  # only now that the row is on the disk: nothing that was counted is lost
+            for monitor in self._reporting:
+                monitor.clear()
         return best
-
-    def _begin_row(self) -> None:
-        """Starts counting again; only now that a row is on the disk: a stop before would lose what was counted."""
-        self._window = Window(self.frames)
-        for monitor in self._reporting:
-            monitor.clear()
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint, unless nothing happened since the last one (:meth:`Saving.save`)."""

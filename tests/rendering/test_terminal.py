@@ -1,4 +1,5 @@
 import io
+from types import SimpleNamespace
 
 import pytest
 from helpers import build
@@ -47,7 +48,7 @@ def test_a_frame_fits_a_terminal_of_80_by_24():
 
 
 def test_without_a_terminal_all_frames_are_printed_at_once(monkeypatch):
-    monkeypatch.setattr(terminal.time, "sleep", lambda _: pytest.fail("nobody is watching"))
+    monkeypatch.setattr(terminal, "time", SimpleNamespace(sleep=lambda _: pytest.fail("nobody is watching")))
     console = Console(file=io.StringIO(), width=100)
     play_in_terminal(walk("v2"), console)
     text = console.file.getvalue()
@@ -57,7 +58,7 @@ def test_without_a_terminal_all_frames_are_printed_at_once(monkeypatch):
 
 def test_in_a_terminal_frames_replace_each_other_at_their_pace(monkeypatch):
     pauses = []
-    monkeypatch.setattr(terminal.time, "sleep", pauses.append)
+    monkeypatch.setattr(terminal, "time", SimpleNamespace(sleep=pauses.append))
     console = Console(file=io.StringIO(), force_terminal=True, width=100, height=40)
     play_in_terminal(walk("v2"), console, fps=4)
     assert pauses == [0.5, 0.25, 0.5, 2.0]

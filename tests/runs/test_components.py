@@ -41,8 +41,8 @@ def test_a_users_monitor_is_logged_cleared_and_stored(tmp_path):
 
 def test_phases_stored_by_earlier_versions_are_refused_with_the_reason(tmp_path):
     trainer = make_training(tmp_path, options={"phase_one": PhaseOne()})
-    phases, components = trainer.algorithm.monitors["phases"], trainer._components
-    trainer._components = lambda: {
+    phases, components = trainer.algorithm.monitors["phases"], trainer._parts
+    trainer._saving._parts = lambda: {
         "phases" if name.startswith("monitor-phases") else name: phases if name.startswith("monitor-") else component
         for name, component in components().items()
         if name not in ("monitor-legs", "monitor-visits")

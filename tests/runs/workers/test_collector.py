@@ -209,7 +209,7 @@ def test_when_the_place_has_gone_none_is_replaced_and_new_episodes_begin_where_i
     with pytest.raises(PlaceLost, match="the place must answer"):
         rounds(collector, 3 if sync else 2)
     assert len(collector.place.started) == 2
-    collector.give_up()
+    collector.give_up(collector.frames)
     state = collector.state_dict()
     assert state["workers"] == [None, None]
     assert collector.metrics()["collector/lost_workers"] == 2
