@@ -5,9 +5,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from helpers import make_training, small_env
+import pytest
+from helpers import make_training, seed_everything, small_env
 
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector
+from hdrqn_torchrl.runs.interruption import Interrupted
 from hdrqn_torchrl.runs.trainer import Trainer
 
 
@@ -46,3 +48,21 @@ def stop_at(trainer: Trainer, frames: int, updates: int) -> None:
         return update(sample)
 
     next(iter(trainer.algorithm.learners.values())).update = stopping
+
+
+def train_whole_and_cut(folder: Path, name: str, *, recording: Callable[..., Any], device: str = "cpu") -> None:
+    """Trains in ``folder/whole``, and in ``folder/cut`` with two stops in mid-iteration once all is recorded."""
+    make = partial(captured_training, name=name, recording=recording, device=device)
+    seed_everything(0)
+    make(folder / "whole").train()
+    seed_everything(0)
+    trainer = make(folder / "cut")
+    for frames in (160, 224):  # recorded by then
+        stop_at(trainer, frames, updates=2)
+        with pytest.raises(Interrupted):
+            trainer.train()
+        seed_everything(99)
+        trainer = make(folder / "cut", seed=99)
+        trainer.resume(trainer.checkpoints.newest())
+        assert trainer.frames == frames and next(iter(trainer.algorithm.learners.values())).updates_due()
+    trainer.train()

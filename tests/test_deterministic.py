@@ -6,8 +6,8 @@ from functools import partial
 
 import pytest
 import torch
-from captured_trainings import captured_training, stop_at
-from helpers import check_same, seed_everything
+from captured_trainings import captured_training, train_whole_and_cut
+from helpers import check_same
 from tape import Tape
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -15,7 +15,6 @@ from hdrqn_torchrl.devices import WORKSPACE, set_deterministic
 from hdrqn_torchrl.learning import learner as learner_module
 from hdrqn_torchrl.learning.captured import Captured
 from hdrqn_torchrl.runs.checkpoint import RandomState
-from hdrqn_torchrl.runs.interruption import Interrupted
 
 NAMES = ("drqn", "v2", "v3")
 
@@ -67,20 +66,7 @@ class TestSetting:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_captured_training_that_is_stopped_and_resumed_equals_an_uninterrupted_one(name, capturing, tmp_path):
-    make = partial(captured_training, name=name, recording=Tape)
-    seed_everything(0)
-    make(tmp_path / "whole").train()
-    seed_everything(0)
-    trainer = make(tmp_path / "cut")
-    for frames in (160, 224):  # recorded by then
-        stop_at(trainer, frames, updates=2)
-        with pytest.raises(Interrupted):
-            trainer.train()
-        seed_everything(99)
-        trainer = make(tmp_path / "cut", seed=99)
-        trainer.resume(trainer.checkpoints.newest())
-        assert trainer.frames == frames and next(iter(trainer.algorithm.learners.values())).updates_due()
-    trainer.train()
+    train_whole_and_cut(tmp_path, name, recording=Tape)
     check_same(tmp_path / "cut", tmp_path / "whole")
 
 

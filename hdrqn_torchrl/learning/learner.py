@@ -191,7 +191,7 @@ class Learner:
                 :meth:`check_finite` raises it.
         """
         self.guard.begin(f"update {self.updates + 1}, frame {self.frames}")
-        if self._draws is not None:
+        if sample is None and self._draws is not None:
             self._draws.refresh()
         if self._captured is None:
             report = self._gradient_step(sample, None)
