@@ -22,24 +22,26 @@ _OURS = Path(hdrqn_torchrl.__file__).parent
 
 
 @contextlib.contextmanager
-def in_words(run: Plan) -> Iterator[None]:
-    """Turns errors of the user and of the machine into messages without a traceback."""
-    from torchrl.checkpoint import CheckpointError
+def in_words(run: Plan, *, trainer: Trainer | None = None) -> Iterator[None]:
+    """Turns errors of the user and of the machine into messages without a traceback.
 
-    from hdrqn_torchrl.learning.finite import NonFiniteError
-    from hdrqn_torchrl.runs.workers import WorkerError
+    Args:
+        run: whose command is told.
+        trainer: of the training in progress; every error then ends with what was saved and the command that goes on
+            from there. The traceback is printed if the error comes from code outside this package: somebody is going
+            to look for it there.
 
+    Raises:
+        SettingsError: what the user must change.
+        RunError: what else has failed.
+    """
     try:
         yield
-    except SettingsError:
-        raise
-    except ValueError as error:
-        raise SettingsError(str(error)) from error
-    except (CheckpointError, NonFiniteError, WorkerError) as error:
-        raise RunError(str(error)) from error
-    except OSError as error:
-        goes_on = command(run.folder, run.config.allowed_targets)
-        raise RunError(f"{error}; when that is fixed, `{goes_on}` goes on from the last checkpoint.") from error
+    except Exception as error:
+        told = _told(error, run, trainer)
+        if told is error:
+            raise
+        raise told from error
 
 
 @contextlib.contextmanager
@@ -59,27 +61,29 @@ def note_error(folder: Path) -> None:
         write_whole(folder / layout.ERROR, traceback.format_exc())
 
 
-@contextlib.contextmanager
-def telling_how_to_go_on(run: Plan, trainer: Trainer) -> Iterator[None]:
-    """Ends a training's error with what was saved and the command that goes on from there.
-
-    The traceback is printed if the error comes from code outside this package: somebody is going to look for it there.
-    """
+def _told(error: Exception, run: Plan, trainer: Trainer | None) -> Exception:
+    """What is raised in its place; itself, if it says all or is a bug."""
     from torchrl.checkpoint import CheckpointError
 
     from hdrqn_torchrl.learning.finite import NonFiniteError
+    from hdrqn_torchrl.runs.workers import WorkerError
 
-    try:
-        yield
-    except CheckpointError:  # it says what was saved
-        raise
-    except NonFiniteError as error:
-        goes_on = command(run.folder, run.config.allowed_targets)
-        raise RunError(f"{error} When that is fixed, `{goes_on}` goes on.") from error
-    except Exception as error:
+    goes_on = f"`{command(run.folder, run.config.allowed_targets)}`"
+    if isinstance(error, CheckpointError):  # it says what was saved
+        return RunError(str(error))
+    if isinstance(error, NonFiniteError):  # so does it
+        return RunError(f"{error} When that is fixed, {goes_on} goes on.")
+    if trainer is not None:
         if not _is_ours(error):
             traceback.print_exc()
-        raise RunError(_told(error, run, trainer)) from error
+        return RunError(_in_training(error, run, trainer, goes_on))
+    if isinstance(error, ValueError) and not isinstance(error, SettingsError):
+        return SettingsError(str(error))
+    if isinstance(error, WorkerError):
+        return RunError(str(error))
+    if isinstance(error, OSError):
+        return RunError(f"{error}; when that is fixed, {goes_on} goes on from the last checkpoint.")
+    return error
 
 
 def _is_ours(error: Exception) -> bool:
@@ -90,18 +94,17 @@ def _is_ours(error: Exception) -> bool:
     return isinstance(error, (OSError, WorkerError)) or Path(frame.f_code.co_filename).is_relative_to(_OURS)
 
 
-def _told(error: Exception, run: Plan, trainer: Trainer) -> str:
+def _in_training(error: Exception, run: Plan, trainer: Trainer, goes_on: str) -> str:
     """A paragraph: what, where, what is left, and how to go on."""
     from hdrqn_torchrl.runs.checkpoint import Checkpoints
 
     newest = Checkpoints(run.folder / layout.CHECKPOINTS).newest()
     what = str(error) if _is_ours(error) else f"{type(error).__name__}: {error}"
     where = f"after frame {trainer.frames:,}, seed {run.config.seed}"
-    goes_on = f"when that is fixed, `{command(run.folder, run.config.allowed_targets)}`"
     end = (
-        f"{goes_on} begins again, as nothing was saved before"
+        "begins again, as nothing was saved before"
         if newest is None
-        else f"{goes_on} goes on from the last checkpoint, {newest.name}"
+        else f"goes on from the last checkpoint, {newest.name}"
     )
     notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
-    return f"{what} ({where}; traceback in {run.folder / layout.ERROR}); {end}.{notes}"
+    return f"{what} ({where}; traceback in {run.folder / layout.ERROR}); when that is fixed, {goes_on} {end}.{notes}"

@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from hdrqn_torchrl.cli import launchers, sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
-from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors, telling_how_to_go_on
+from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
 from hdrqn_torchrl.cli.together import plans, train_together
 from hdrqn_torchrl.runs import layout
@@ -114,7 +114,7 @@ def pieces(run: Plan, stop: StopRequest) -> Generator[None, None, float]:
         yield
         with noting_errors(run):
             try:
-                with telling_how_to_go_on(run, trainer):
+                with in_words(run, trainer=trainer):
                     yield from trainer.pieces()
             finally:
                 trainer.collector.shutdown()

@@ -7,7 +7,7 @@ import pytest
 from helpers import make_training
 
 from hdrqn_torchrl.cli.configuration import RunError
-from hdrqn_torchrl.cli.failures import noting_errors, telling_how_to_go_on
+from hdrqn_torchrl.cli.failures import in_words, noting_errors
 from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.learning.finite import NonFiniteError
 
@@ -20,7 +20,7 @@ def told(folder, error, *, saved=False):
     if saved:
         trainer.train()
     trainer.frames = 128
-    with pytest.raises(RunError) as reason, noting_errors(plan), telling_how_to_go_on(plan, trainer):
+    with pytest.raises(RunError) as reason, noting_errors(plan), in_words(plan, trainer=trainer):
         raise error
     return str(reason.value)
 
