@@ -132,7 +132,13 @@ class RayLauncher(ElsewhereLauncher):
         from hdrqn_torchrl.runs.workers.ray_cluster import RayCluster, load_ray
 
         os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
-        cluster, ray = RayCluster(cores=os.cpu_count() or 1, address=self.address, show_output=True), load_ray()
+        try:
+            cluster = RayCluster(
+                cores=os.cpu_count() or 1, address=self.address, show_output=True, setting="hydra.launcher.address"
+            )
+        except (ImportError, OSError) as error:  # of the machine
+            sys.exit(f"error: {error}")
+        ray = load_ray()
         run = ray.remote(
             num_cpus=self.cores_per_job, num_gpus=self.gpus_per_job, max_retries=self.restarts, max_calls=1
         )(_call)
@@ -213,7 +219,10 @@ class SlurmLauncher(ElsewhereLauncher):
         return results
 
     def _submit(self, jobs: list[PreemptedJob]) -> list[Any]:
-        submitit = _submitit()
+        try:
+            submitit = _submitit()
+        except ImportError as error:
+            sys.exit(f"error: {error}")
         options = {} if self.cluster == "local" else {"slurm_max_num_timeout": self.requeues}
         executor = submitit.AutoExecutor(self.folder, cluster=self.cluster, **options)
         given = {name: value for name, value in self.parameters.items() if value is not None}

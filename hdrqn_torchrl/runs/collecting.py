@@ -11,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.learning.captured import wants_capture
+from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build_algorithm
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector, can_capture
 from hdrqn_torchrl.runs.collectors import ResumableCollector
@@ -39,6 +40,7 @@ def make_collector(
 
     Raises:
         ValueError: if the worlds can't be divided among the workers.
+        SettingsError: if there is no Ray, or no cluster of it.
     """
     chosen, worlds = settings.collector, env.batch_size[0]
     frames_per_batch = worlds * settings.steps_per_batch
@@ -94,4 +96,7 @@ def _place(settings: RunSettings, make: partial[Worker]) -> WorkerPlace:
         return ProcessWorkers(make)
     from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
 
-    return RayWorkers(make, workers=settings.collector.workers, address=settings.collector.address)
+    try:
+        return RayWorkers(make, workers=settings.collector.workers, address=settings.collector.address)
+    except (ImportError, OSError) as error:  # of the machine, not of a setting
+        raise SettingsError(str(error)) from error

@@ -96,6 +96,14 @@ class TestJob:
         assert sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl") == [note]
 
 
+@needs_ray
+def test_a_sweep_without_a_cluster_ends_in_words(tmp_path):
+    launcher = Begun(tmp_path, "ray").launcher
+    launcher.address = "127.0.0.1:1"
+    with pytest.raises(SystemExit, match=r"error: hydra\.launcher\.address must be .* cluster, got '127"):
+        launcher.launch([["algo=hdqn"]], 0)
+
+
 class TestPreemptedJob:
     def run(self, folder, task):
         requeued = []

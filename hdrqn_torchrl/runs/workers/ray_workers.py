@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -26,7 +27,8 @@ class RayWorkers:
     """
 
     def __init__(self, make: partial[Worker], *, workers: int, address: str | None = None) -> None:
-        self.cluster = RayCluster(cores=workers, address=address)
+        self.cluster = RayCluster(cores=workers, address=address, setting="collector.address")
+        _warn_of_few_cores(workers)
         self._actor = load_ray().remote(num_cpus=1, max_restarts=0)(Worker)
         self.make = make
 
@@ -43,6 +45,17 @@ class RayWorkers:
     def close(self) -> None:
         """Ends the cluster, or the connection to it, if it began here."""
         self.cluster.close()
+
+
+def _warn_of_few_cores(workers: int) -> None:
+    """A worker without a core waits without a word."""
+    cores = int(load_ray().cluster_resources().get("CPU", 0))
+    if cores < workers:
+        print(
+            f"warning: collector.workers should be at most the Ray cluster's number of cores, {cores}, got {workers}; "
+            "workers wait until machines join it",
+            file=sys.stderr, flush=True,
+        )  # fmt: skip
 
 
 class RayWorker:

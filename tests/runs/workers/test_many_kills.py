@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from functools import partial
+from importlib.util import find_spec
 
 import pytest
 import torch
@@ -16,14 +17,35 @@ from hdrqn_torchrl.runs.workers import ProcessWorkers, Worker, WorkersCollector
 KILLS, WORLDS, WORKERS, ROUNDS = 20, 8, 2, 110
 
 
+def place_of(kind, make):
+    if kind == "processes":
+        return ProcessWorkers(make)
+    from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
+
+    return RayWorkers(make, workers=WORKERS)
+
+
+def process_of(kind, worker) -> int:
+    """Its number."""
+    if kind == "processes":
+        return worker.process.pid
+    import ray
+
+    return ray.get(worker.actor.__ray_call__.remote(lambda _: os.getpid()))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["v2"])
-def test_each_of_twenty_kills_costs_only_the_episodes_in_progress(agent):
+@pytest.mark.parametrize(
+    "kind",
+    ["processes", pytest.param("ray", marks=pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray"))],
+)
+@pytest.mark.parametrize("agent", ["v2", "v3"])
+def test_each_of_twenty_kills_costs_only_the_episodes_in_progress(agent, kind):
     torch.manual_seed(0)
     algorithm = AGENTS[agent](StampedWorlds(WORLDS, seed=0))
     make = partial(Worker, partial(make_part, agent, WORLDS // WORKERS), steps=8, all_worlds=WORLDS, threads=1)
     collector = WorkersCollector(
-        ProcessWorkers(make), algorithm.transform(StampedWorlds(WORLDS, seed=0)), algorithm.policy, workers=WORKERS,
+        place_of(kind, make), algorithm.transform(StampedWorlds(WORLDS, seed=0)), algorithm.policy, workers=WORKERS,
         total_frames=10**9, sync=False,
     )  # fmt: skip
     seen, batches, killed = [], iter(collector), set()
@@ -34,8 +56,9 @@ def test_each_of_twenty_kills_costs_only_the_episodes_in_progress(agent):
             if learner.updates_due():
                 learner.learn()
         collector.update_policy_weights_()
-        if index % 5 == 2 and len(killed) < KILLS:
-            pid = collector._workers[index % WORKERS].process.pid
+        if index % 5 == 1:
+            pid = process_of(kind, collector._workers[index // 5 % WORKERS])
+        if index % 5 == 2 and len(killed) < KILLS:  # it is collecting
             os.kill(pid, signal.SIGKILL)
             killed.add(pid)
     assert collector.metrics()["collector/lost_workers"] == len(killed) == KILLS
@@ -46,7 +69,7 @@ def test_each_of_twenty_kills_costs_only_the_episodes_in_progress(agent):
     sequences = check_sequences(algorithm)
     options = check_options(algorithm, seen) if agent == "v2" else len(options_by_hand(seen))
     ended, cut = episodes_of(whole)
-    print(f"{agent}: {len(killed)} kills, {sequences} sequences, {options} options, {ended} episodes whole, {cut} cut")
+    print(f"{agent}, {kind}: {sequences} sequences, {options} options, {ended} episodes whole, {cut} cut")
     assert sequences >= 300 and options >= 1_000
     assert cut <= KILLS * WORLDS // WORKERS
 
