@@ -23,13 +23,13 @@ from hdrqn_torchrl.envs.gym.arguments import (
     make_world,
     refuse_ignored,
     rule_of,
-    settings_error,
     subgoals_of,
     wrappers_of,
 )
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
 from hdrqn_torchrl.envs.gym.given import check_given, checked_world, wrapped
 from hdrqn_torchrl.envs.gym.observations import Channels, make_encoder
+from hdrqn_torchrl.envs.gym.pools import mask_place_of, pool_of, spec_of
 from hdrqn_torchrl.envs.gym.returned import begun
 from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
 from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper
@@ -90,7 +90,8 @@ def make_gym(
         largest_return: of an episode, if known: it bounds the targets.
         smallest_return: likewise.
         backend: ``"envpool"`` steps the worlds in C++, if it has the id: ``pip install 'hdrqn_torchrl[envpool]'``. Its
-            worlds can't be looked into, all actions count as available, and a resumed training begins new episodes.
+            worlds can't be looked into, and a resumed training begins new episodes. Actions are masked as its entry
+            ``action_mask`` or ``legal_action_mask`` of the observation or of ``info`` says.
         processes: each world has a process of its own.
         seed: of all episodes; ``None`` draws one from torch's global generator.
         device: device of all tensors.
@@ -261,26 +262,11 @@ def _given(vector: VectorEnv, num_envs: int, read: Callable) -> _Made:
 
 def _pooled(id: str | EnvFactory, num_envs: int, read: Callable, settings: Mapping[str, Any]) -> _Made:
     """Worlds of EnvPool."""
-    try:
-        import envpool
-    except ImportError as error:
-        raise ImportError("backend='envpool' needs EnvPool: pip install 'hdrqn_torchrl[envpool]'.") from error
-    if not isinstance(id, str) or id not in envpool.list_all_envs():
-        raise ValueError(f"id must be one that EnvPool has, got {id!r}; use backend='gymnasium'.")
-    try:
-        spec = envpool.make_spec(id, num_envs=num_envs, seed=0, **settings)
-    except TypeError as error:
-        raise settings_error(id, settings, error) from error
-    reading, actions = read(spec.gymnasium_observation_space, spec.gymnasium_action_space, masked=False)
-    limit = spec.config.max_episode_steps
-    worlds = PooledWorlds(partial(_pool, id, num_envs, dict(settings)), reading, num_envs)
+    spec = spec_of(id, num_envs, settings)
+    mask, limit = mask_place_of(spec), spec.config.max_episode_steps
+    reading, actions = read(spec.gymnasium_observation_space, spec.gymnasium_action_space, masked=mask is not None)
+    worlds = PooledWorlds(partial(pool_of, str(id), num_envs, dict(settings)), reading, num_envs, mask=mask)
     return _Made(worlds=worlds, reading=reading, actions=actions, max_steps=limit if 0 < limit < 2**31 - 1 else None)
-
-
-def _pool(id: str, num_envs: int, settings: Mapping[str, Any], seed: int) -> Any:
-    import envpool
-
-    return envpool.make(id, env_type="gymnasium", num_envs=num_envs, seed=seed, **settings)
 
 
 def _limit(max_steps: int | None) -> dict[str, Any]:

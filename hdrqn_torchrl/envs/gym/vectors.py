@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs.gym.pools import MaskPlace
 from hdrqn_torchrl.envs.gym.worlds import Entries, Reading, World
 
 Mask = NDArray[np.bool_]
@@ -168,10 +170,13 @@ class PooledWorlds(_WithoutState):
         make: makes a pool for a seed, with Gymnasium's interface.
         reading: how entries are read.
         num_envs: N.
+        mask: where pools tell which actions can be chosen; ``None``: nowhere.
     """
 
-    def __init__(self, make: Callable[[int], Any], reading: Reading, num_envs: int) -> None:
-        self._make = make
+    def __init__(
+        self, make: Callable[[int], Any], reading: Reading, num_envs: int, *, mask: MaskPlace | None = None
+    ) -> None:
+        self._make, self._mask = make, mask
         self.pool: Any = None  # until there is a seed
         self._worlds = [World(reading) for _ in range(num_envs)]
         self._rows: list[Entries] = [{} for _ in self._worlds]
@@ -187,7 +192,7 @@ class PooledWorlds(_WithoutState):
         chosen = mask.nonzero()[0].astype(np.int32)
         shown, info = self.pool.reset(chosen)
         for place, index in enumerate(chosen):
-            self._rows[index] = self._worlds[index].begin(_row(shown, place), _info_of(info, place))
+            self._rows[index] = self._worlds[index].begin(_row(shown, place), self._told(shown, info, place))
         return _stacked(self._rows)
 
     def step(self, actions: NDArray[np.int64]) -> Outcome:
@@ -195,9 +200,17 @@ class PooledWorlds(_WithoutState):
         shown, reward, terminated, truncated, info = self.pool.step(actions.astype(np.int32))
         rewards = np.zeros(len(self._worlds), np.float32)
         for index, world in enumerate(self._worlds):
-            ends, told = (terminated[index], truncated[index]), _info_of(info, index)
+            ends, told = (terminated[index], truncated[index]), self._told(shown, info, index)
             self._rows[index], rewards[index], *_ = world.step(_row(shown, index), reward[index], *ends, told)
         return Outcome(_stacked(self._rows), rewards, terminated, truncated & ~terminated)
+
+    def _told(self, shown: Any, info: Mapping[str, Any], index: int) -> dict[str, Any]:
+        """One world's ``info``, with the mask of its actions where agents look for it."""
+        told = _info_of(info, index)
+        if self._mask is None:
+            return told
+        part = shown if self._mask.part == "obs" else info
+        return {**told, keys.ACTION_MASK: part[self._mask.name][index]}
 
 
 def _row(batch: Any, index: int) -> Any:

@@ -187,38 +187,6 @@ class TestState:
             make_gym(Counter, 2).load_state_dict(env.state_dict())
 
 
-class TestEnvPool:
-    @pytest.fixture
-    def seeds(self, monkeypatch):
-        """Those of the pools that were made."""
-        envpool = pytest.importorskip("envpool")
-        seeds, make = [], envpool.make
-
-        def counting(id, *, seed, **options):
-            seeds.append(seed)
-            return make(id, seed=seed, **options)
-
-        monkeypatch.setattr(envpool, "make", counting)
-        return seeds
-
-    def test_makes_one_pool_for_one_environment_and_another_for_another_seed(self, seeds):
-        env = make_gym("CartPole-v1", 3, backend="envpool", max_steps=9, seed=4)
-        assert seeds == [4] and env.task.max_steps == 9
-        first = played(env, 12)
-        env.set_seed(5)
-        other = played(env, 12)
-        env.set_seed(4)
-        again = played(env, 12)
-        assert seeds == [4, 5, 4]
-        assert torch.equal(first["observation"], again["observation"])
-        assert not torch.equal(first["observation"], other["observation"])
-        assert first["next", "truncated"].any() and first["observation"].shape == (3, 12, 4)
-
-    def test_refuses_settings_that_the_environment_does_not_take(self, seeds):
-        with pytest.raises(ValueError, match=r"settings must be arguments that CartPole-v1 takes, got \['wheels'\]"):
-            make_gym("CartPole-v1", 2, backend="envpool", settings={"wheels": 4})
-
-
 @pytest.mark.parametrize(
     ("id", "settings", "words"),
     [
