@@ -34,19 +34,14 @@ _FIGURES = {
 LONGEST_EPISODE = 10_000
 """Steps after which an episode of unknown length is taken to have no end; tasks of longer ones state their length."""
 PATIENCE = 1_000
-"""Steps after which a message says that an evaluation waits for episodes to end."""
+"""Steps after which an evaluation asks for a limit if no episode has ended, or says that it waits for some."""
 
 
 class Observer(Protocol):
     """Something that counts what happens."""
 
     def add_step(self, step: TensorDictBase, counted: Tensor | None = None) -> None:
-        """Takes one step of all environments ``[N]``, its outcome below ``"next"``.
-
-        Args:
-            step: of all environments.
-            counted: which of them count, ``[N]`` bool; ``None``: all.
-        """
+        """Takes one step of all environments ``[N]``, its outcome below ``"next"``; only those ``counted`` count."""
         ...
 
 
@@ -196,7 +191,7 @@ def play(
         exploration_type: ``ExplorationType.RANDOM`` plays with the policy's current epsilon.
         observers: are shown every step and told where it belongs to an episode that counts: environments that are done
             with theirs go on, and short episodes would be seen too often.
-        max_steps: steps after which an episode is cut off if it has not ended before; ``None``: none is.
+        max_steps: steps after which an episode is cut off if it has not ended before; needed for tasks without end.
 
     Returns:
         One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)`` and, if ``max_steps`` is
@@ -204,7 +199,7 @@ def play(
 
     Raises:
         ValueError: if ``max_steps`` is below 1, or if without it an episode does not end: after as many steps as the
-            task states or, if it states none, :data:`LONGEST_EPISODE`.
+            task states or, if it states none, :data:`LONGEST_EPISODE`, or :data:`PATIENCE` if none ends at all.
     """
     if max_steps is not None and max_steps < 1:
         raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None plays episodes to their end.")
@@ -262,12 +257,7 @@ def _play_once(
     longest = max_steps or task.max_steps or LONGEST_EPISODE
     for step in range(longest):
         if step == PATIENCE and max_steps is None and task.max_steps is None:
-            warnings.warn(
-                f"env should end its episodes or state how long they are, got {int(playing.sum())} of {len(playing)} "
-                f"that have not ended after {step:,} steps; an evaluation waits for {longest:,}, or for max_steps "
-                "(evaluation.max_steps on the command line).",
-                stacklevel=4,
-            )
+            _ask_for_a_limit(playing)
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))
         after = tensordict.get("next")
         sums = tracker.add(after)
@@ -289,6 +279,20 @@ def _play_once(
             "state the length of longer ones in its task, or let evaluations cut them off (max_steps)."
         )
     return episodes
+
+
+def _ask_for_a_limit(playing: Tensor) -> None:
+    """Refuses to wait where no episode ``[N]`` has ended; says how long it may take where some have."""
+    if playing.all():
+        raise ValueError(
+            f"max_steps must be given where no length of episodes is known and none of {len(playing)} has ended after "
+            f"{PATIENCE:,} steps, got None; evaluation.max_steps=1000 cuts them off."
+        )
+    warnings.warn(
+        f"env should end its episodes or state how long they are, got {int(playing.sum())} of {len(playing)} that have "
+        f"not ended after {PATIENCE:,} steps; an evaluation waits for {LONGEST_EPISODE:,}, or evaluation.max_steps.",
+        stacklevel=5,
+    )
 
 
 def _mean(values: Tensor) -> float:

@@ -2,6 +2,8 @@ import warnings
 
 import pytest
 import torch
+from gym_toys import Counter
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from helpers import LEFT, RIGHT, build, collect, small_env, subgoal_env
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -9,7 +11,7 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from user_envs import Corridor
 
 from hdrqn_torchrl.analysis.episodes import summarise
-from hdrqn_torchrl.envs import Task, task_of
+from hdrqn_torchrl.envs import Task, make_gym, task_of
 from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round
 
@@ -211,23 +213,33 @@ class TestTasksOfOthers:
         assert "in_order_rate" not in result
         assert "in_order" not in EpisodeTracker().finished(collect(build("v1", Corridor(4)), Corridor(4), 8)[0])
 
-    def test_an_episode_without_end_is_an_error(self, monkeypatch):
-        monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.LONGEST_EPISODE", 40)
-        with pytest.raises(
-            ValueError, match=r"env must end its episodes, got 4 of 4 .* after 40 steps; give it a time"
-        ):
+    def test_tasks_without_end_need_a_limit(self, monkeypatch):
+        monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.PATIENCE", 20)
+        with pytest.raises(ValueError, match=r"max_steps must be given where .* none of 4 has ended after 20 steps"):
             self.played(length=None)
-        with pytest.raises(ValueError, match="got 4 of 4 that had not ended after 5 steps"):
+        assert self.played(length=20)["steps_mean"] == 20
+        with pytest.raises(ValueError, match="env must end its episodes, got 4 of 4 that had not ended after 5 steps"):
             self.played(length=6, task=Task(max_steps=5))
         assert self.played(length=41, task=Task(max_steps=41))["steps_mean"] == 41
 
-    def test_a_long_wait_for_the_end_of_an_episode_is_announced(self, monkeypatch):
+    def test_a_stated_length_is_waited_for_without_a_word(self, monkeypatch):
         monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.PATIENCE", 20)
-        with pytest.warns(UserWarning, match=r"got 4 of 4 that have not ended after 20 steps; .* or for max_steps"):
-            self.played(length=30)
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
             self.played(length=30, task=Task(max_steps=30))
+
+    def test_a_wait_for_the_last_episodes_to_end_is_announced_and_has_an_end(self, monkeypatch):
+        """One of two counters ends at 10, and the other one counts on."""
+        monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.PATIENCE", 20)
+        monkeypatch.setattr("hdrqn_torchrl.runs.evaluation.LONGEST_EPISODE", 40)
+        vector = SyncVectorEnv([Counter, lambda: Counter(ends=False)], autoreset_mode=AutoresetMode.DISABLED)
+        with (
+            pytest.warns(
+                UserWarning, match=r"got 1 of 2 that have not ended after 20 steps; .* or evaluation.max_steps"
+            ),
+            pytest.raises(ValueError, match=r"env must end its episodes, got 1 of 2 .* after 40 steps; give it a time"),
+        ):
+            play(make_gym(vector, 2), always(1), episodes=2)
 
     @pytest.mark.parametrize(("length", "steps", "cut"), [(None, 9, 1.0), (6, 6, 0.0), (9, 9, 0.0)])
     def test_evaluations_can_cut_episodes_off_and_say_so(self, length, steps, cut):
