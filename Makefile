@@ -18,7 +18,7 @@ setup: .venv/.ready
 train: setup
 	$(BIN)/python train.py env=gridworld algo=v2 $(ARGS)
 
-test: setup lint examples
+test: setup lint
 	$(BIN)/python -m pytest -m 'not slow' -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-slow: setup
@@ -33,6 +33,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# As tests/test_examples.py does, each as a program of its own.
 examples: setup
 	$(BIN)/python examples/reuse_transform.py --frames 2000
 	$(BIN)/python examples/reuse_loss.py --updates 60
