@@ -3,6 +3,7 @@ from functools import partial
 
 import pytest
 import torch
+from processes import FORK
 from torchrl.envs import EnvCreator, ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs, step_mdp
 
@@ -43,7 +44,7 @@ def test_the_specs_of_the_grid_are_right_in_a_serial_env():
 
 
 def test_the_specs_of_the_grid_are_right_in_a_parallel_env():
-    env = ParallelEnv(2, partial(MultiGoalGridEnv, 2, seed=0), mp_start_method="spawn")
+    env = ParallelEnv(2, partial(MultiGoalGridEnv, 2, seed=0), mp_start_method=FORK.get_start_method())
     try:
         check_env_specs(env)
     finally:
