@@ -138,15 +138,16 @@ def check_message(number, told):
 
 
 def check_trains(number, folder):
-    """There are at least two rows, and every cell is a finite number or empty."""
+    """There are at least two rows, a ceiling only if it was asked for, and all cells are finite numbers or empty."""
     told = refused(number, folder, train.train)
     if told is not None:
         check_message(number, told)
         return
     with (folder / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) > 1 and "greedy/ceiling" not in rows[0]  # nobody played
-    assert json.loads((folder / "summary.json").read_text())["ceiling"] is None
+    ceiling = json.loads((folder / "summary.json").read_text())["ceiling"]
+    plays = configure(*draw(number)).evaluation.ceilings
+    assert len(rows) > 1 and plays == (ceiling is not None) == ("greedy/ceiling" in rows[0])
     cells = [(name, cell) for row in rows for name, cell in row.items() if cell]
     assert [(name, cell) for name, cell in cells if not math.isfinite(float(cell))] == [], draw(number)
 

@@ -203,8 +203,8 @@ def _check_learner(learner: LearnerSettings) -> None:
     """Refuses settings that have no meaning for v3, or another one."""
     if learner.sampling not in FROM_STARTS and not learner.stored_state:
         raise ValueError(
-            f"sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its memory "
-            "lasts a whole episode and would start empty in mid-episode; use one of them, or stored_state=True."
+            f"learner.sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its "
+            "memory lasts a whole episode and would start empty in mid-episode; use one of them, or stored_state=True."
         )
     if learner.trace_decay or learner.n_step > 1:
         raise ValueError(
@@ -213,8 +213,8 @@ def _check_learner(learner: LearnerSettings) -> None:
         )
     if learner.max_target is not None:
         raise ValueError(
-            f"max_target must be None for v3, got {learner.max_target}; the meta level's targets are bounded by "
-            "max_meta_target, those of the other levels by the reward for reaching the subgoal."
+            f"learner.max_target must be None for v3, got {learner.max_target}; the meta level's targets are bounded "
+            "by max_meta_target, those of the other levels by the reward for reaching the subgoal."
         )
 
 
@@ -278,8 +278,8 @@ def _with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
     length = "of unknown length" if task.max_steps is None else f"of up to {task.max_steps} steps"
     if learner.sampling == "whole_episodes":
         raise ValueError(
-            f"slice_len must be a number with sampling='whole_episodes' and episodes {length}, got None; give one, or "
-            "use sampling='steps' with stored_state=True."
+            f"learner.slice_len must be a number with sampling='whole_episodes' and episodes {length}, got None; give "
+            "one, or use sampling='steps' with stored_state=True."
         )
     warnings.warn(
         f"v3 learns from episodes {length} in sequences of {SHORT_SEQUENCE} steps that begin anywhere, from stored "

@@ -204,7 +204,7 @@ class TestSequencesOfV3:
         given = {"sampling": "steps", "stored_state": True, "burn_in": 0.5}
         assert self.settings(env, **given) == replace(V3_LEARNER, slice_len=32, **given)
         with pytest.raises(
-            ValueError, match=r"slice_len must be a number with .*'whole_episodes' and .* up to 400 steps"
+            ValueError, match=r"learner\.slice_len must be a number with .*'whole_episodes' and .* up to 400 steps"
         ):
             self.settings(env, sampling="whole_episodes")
 
@@ -701,7 +701,8 @@ class TestV3:
     @pytest.mark.parametrize("sampling", ["steps", "episodes"])
     def test_sampling_in_mid_episode_is_refused(self, sampling):
         with pytest.raises(
-            ValueError, match=rf"sampling must be one of \(.*\) for v3 without stored_state, got '{sampling}': "
+            ValueError,
+            match=rf"learner\.sampling must be one of \(.*\) for v3 without stored_state, got '{sampling}': ",
         ):
             self.make(learner={"sampling": sampling})
 

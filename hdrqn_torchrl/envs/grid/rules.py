@@ -96,8 +96,8 @@ class GridRules:
         needed = 1 + num_obstacles + num_goals + (obstacle == "teleport")  # teleport: a cell to move to
         if len(free) < needed:
             raise ValueError(
-                f"layout has {len(free)} free cells, but the agent, {num_obstacles} obstacles and {num_goals} goals "
-                f"need {needed}; use a larger layout, or a smaller num_obstacles or num_goals."
+                f"layout must have at least {needed} free cells for the agent, {num_obstacles} obstacles and "
+                f"{num_goals} goals, got {len(free)}; use a larger layout, or a smaller num_obstacles or num_goals."
             )
         self.num_goals, self.num_obstacles, self.teleport = num_goals, num_obstacles, obstacle == "teleport"
         self.view = view or 2 * self._span(free) + 3  # from any free cell all others and the walls around them
