@@ -26,27 +26,23 @@ from hdrqn_torchrl.runs.building import build_algorithm
 NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
 
 
-@pytest.mark.parametrize(("network", "layout"), [("compact", "open"), ("paper", "four_rooms")])
+PLAIN = [(name, {}) for name in ("dqn", "drqn", "hdqn", "v1", "v2", "v3")]
+CHANGED = [
+    ("v2", {"meta_input": "cell"}),
+    ("v2", {"meta_input": "both"}),
+    ("v2", {"meta_input_time": "after_last_observation"}),
+    *((name, {"sub_hindsight": True, "meta_hindsight": True}) for name in ("hdqn", "v1", "v2")),
+]
+
+
 @pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("dqn", {}),
-        ("drqn", {}),
-        ("hdqn", {}),
-        ("v1", {}),
-        ("v2", {}),
-        ("v2", {"meta_input": "cell"}),
-        ("v2", {"meta_input": "both"}),
-        ("v2", {"meta_input_time": "after_last_observation"}),
-        ("hdqn", {"sub_hindsight": True, "meta_hindsight": True}),
-        ("v1", {"sub_hindsight": True, "meta_hindsight": True}),
-        ("v2", {"sub_hindsight": True, "meta_hindsight": True}),
-        ("v3", {}),
-    ],
+    ("name", "options", "network"),
+    [*((*each, "compact") for each in PLAIN + CHANGED), *((*each, "paper") for each in PLAIN)],
     ids=lambda value: value if isinstance(value, str) else "-".join(str(option) for option in value.values()),
 )
-def test_every_algorithm_collects_and_updates_each_level(name, options, network, layout):
+def test_every_algorithm_collects_and_updates_each_level(name, options, network):
     torch.manual_seed(0)
+    layout = {"compact": "open", "paper": "four_rooms"}[network]
     env = MultiGoalGridEnv(4, layout=layout, max_steps=6, seed=0)
     algorithm = build(name, env, NETWORKS[network], settings=tiny_settings(batch_size=16), **options)
     learners = {"dqn": ["flat"], "drqn": ["flat"], "v3": ["joint"]}

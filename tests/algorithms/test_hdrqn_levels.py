@@ -187,15 +187,18 @@ def test_targets_of_three_levels_by_hand():
     assert counted["sub"] > 5
 
 
-@pytest.mark.parametrize("name", ["hdqn", "v1", "v2"])
 @pytest.mark.parametrize(
-    "settings",
+    ("name", "settings"),
     [
-        {},
-        {"priority_exponent": 0.9, "slice_len": 2},
-        {"sampling": "whole_episodes"},
-        {"trace_decay": 0.5},
-        {"n_step": 2},
+        ("v2", {}),
+        ("v2", {"priority_exponent": 0.9, "slice_len": 2}),
+        ("v2", {"sampling": "whole_episodes"}),
+        ("v2", {"trace_decay": 0.5}),
+        ("v2", {"n_step": 2}),
+        ("v1", {"sampling": "whole_episodes"}),
+        ("v1", {"trace_decay": 0.5}),
+        ("hdqn", {}),
+        ("hdqn", {"n_step": 2}),
     ],
     ids=str,
 )

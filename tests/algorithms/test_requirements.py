@@ -266,8 +266,11 @@ class TestEntries:
         build("dqn", TransformedEnv(env, RenameTransform(["view"], ["observation"])))
 
 
-@pytest.mark.parametrize("without", [("hazard", "success"), ("hazard", "success", "truncated")], ids=str)
-@pytest.mark.parametrize("options", [{}, {"hazard_reward": 0.0}], ids=str)
+@pytest.mark.parametrize(
+    ("without", "options"),
+    [(("hazard", "success"), {"hazard_reward": 0.0}), (("hazard", "success", "truncated"), {})],
+    ids=["success", "truncated"],
+)
 @pytest.mark.parametrize("name", [*EVERY, "hindsight"])
 def test_agents_learn_without_optional_entries(name, options, without):
     env = Corridor(N, without=without)
