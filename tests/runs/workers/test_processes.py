@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import time
 from functools import partial
 
 import pytest
 import torch
+from processes import FORK
 from stamped_worlds import (
     AGENTS,
     StampedWorlds,
@@ -33,6 +35,13 @@ def collector_of(make, *, workers=2, **arguments):
     )  # fmt: skip
 
 
+@pytest.fixture
+def forked(monkeypatch):
+    """Workers start fast: they are forked from a process that has imported everything."""
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: FORK)
+
+
+@pytest.mark.usefixtures("forked")
 def test_a_killed_worker_is_replaced_and_none_is_left_behind(capsys):
     collector = collector_of(partial(make_part, "v3", WORLDS // 2))
     batches = iter(collector)
@@ -60,6 +69,7 @@ def test_what_is_sent_is_a_copy():
     collector.shutdown()
 
 
+@pytest.mark.usefixtures("forked")
 def test_an_error_in_a_worker_ends_the_collection_and_is_told():
     collector = collector_of(make_failing_part, workers=1)
     with pytest.raises(WorkerError, match="RuntimeError: no such world"):
