@@ -18,6 +18,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.types import HydraContext
+from processes import run_script
 from programs import ROOT, TINY, TINY_HDRQN, wait_until
 
 from hdrqn_torchrl.cli import launchers, sweeps
@@ -161,11 +162,10 @@ def without_times(rows):
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    """The rows of a job that nothing happens to."""
+    """The rows of a training with a job's settings that nothing happens to."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    process = start(folder, "-m", "seed=0")
-    _, told = process.communicate(timeout=240)
-    assert process.returncode == 0, told
+    code, _, told = run_script(folder, *COMMON, "seed=0", "hydra.run.dir=sweep/0-alone")
+    assert code == 0, told
     return without_times(logged(folder))
 
 
