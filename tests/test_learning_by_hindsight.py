@@ -57,8 +57,15 @@ def largest_errors(sub):
 
 @pytest.mark.parametrize(
     ("builder", "settings"),
-    [(make_hdqn, {}), (make_hdrqn, {"slice_len": 4, "trace_decay": 0.8, "batch_size": 32})],
-    ids=["hdqn", "v2-lambda"],
+    [
+        pytest.param(make_hdqn, {}, id="hdqn"),
+        pytest.param(
+            make_hdrqn,
+            {"slice_len": 4, "trace_decay": 0.8, "batch_size": 32},
+            id="v2-lambda",
+            marks=pytest.mark.slow,  # tests/data/test_hindsight.py compares its sequences with plain loops
+        ),
+    ],
 )
 def test_hindsight_learns_the_values_of_a_subgoal_that_was_never_pursued(builder, settings):
     """From random play in which every option was sent to goal 0."""
