@@ -16,6 +16,7 @@ ATTAINED = "attained"  # [G] bool: subgoals reached in this step, whichever was 
 AVAILABLE = "available"  # [G] bool: subgoals worth choosing now; optional
 ACTION_MASK = "action_mask"  # [A] bool: actions that can be chosen now; optional
 HAZARD = "hazard"  # [1] bool: obstacle hit or life lost in this step
+EVENTS = "events"  # [K] int64: what happened in this step, where an agent finds its subgoals itself (discovery/)
 SUCCESS = "success"  # [1] bool: the whole task was completed in this step
 IS_INIT = "is_init"  # [1] bool: first step of an episode
 PIXELS = "pixels"  # [height, width, 3] uint8: the whole screen

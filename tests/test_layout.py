@@ -9,8 +9,8 @@ import hdrqn_torchrl
 from hdrqn_torchrl.runs import commands, layout
 
 ORDER = (
-    "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "algorithms", "runs",
-    "analysis", "rendering", "cli",
+    "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "discovery", "algorithms",
+    "runs", "analysis", "rendering", "cli",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

@@ -88,7 +88,7 @@ def quick_v2(env):
     )
 
 
-def quick_v3(env):
+def quick_v3(env, **options):
     settings = QUICK | {"learning_rate": 3e-3, "tau": 0.02, "batch_size": 16}
     return make_v3(
         env,
@@ -99,6 +99,7 @@ def quick_v3(env):
         wrong_subgoal_reward=-0.5,
         sub_exploration=RepeatingEpsilonGreedy(1.0, 0.1, max_repeats=4, **SOON),
         meta_exploration=EpsilonGreedy(1.0, 0.1, **SOON),
+        **options,
     )
 
 

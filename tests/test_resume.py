@@ -9,8 +9,10 @@ from functools import cache, partial
 
 import pytest
 import torch
+from hand_given import BOTH_GOALS, HandGiven
 from helpers import check_same, check_same_checkpoint, house, make_training, seed_everything, table
 
+from hdrqn_torchrl.discovery import Chosen
 from hdrqn_torchrl.envs import make_gym, make_minigrid
 from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
@@ -64,6 +66,20 @@ TRAININGS = {
     ),
     "drqn-gymnasium": partial(make_training, name="drqn", worlds=cart_and_pole),
     "v3-minigrid": partial(make_training, name="v3", worlds=door_and_key),
+    "v3-discovered": partial(
+        make_training,
+        name="v3",
+        learner={"warmup_frames": BATCH},  # after a batch that memories forget
+        options={
+            "subgoals": "discovered",
+            "discovery": HandGiven(
+                max_subgoals=2,
+                warmup_frames=BATCH,
+                discovery_frames=2 * BATCH,
+                chosen=(Chosen({1: 1}), BOTH_GOALS, Chosen({2: 1}, once=(1,))),
+            ),
+        },
+    ),
 }
 
 
@@ -177,6 +193,7 @@ PAIRS += [(training, "in the middle of options") for training in ("v1-three-leve
 PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of metrics", *FEW[1:])]
 PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole", "levels"))]
 PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
+PAIRS += [("v3-discovered", cut) for cut in ("during warm-up", *FEW)]
 PAIRS += [(training, "in the middle of options") for training in ("drqn-gymnasium", "v3-minigrid")]
 OTHERS = [("v2-odd", "in the first evaluation"), ("v3-r2d2", "in the first evaluation")]
 OTHERS += [("v1-r2d2", "with full memories")]

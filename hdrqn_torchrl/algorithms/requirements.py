@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from tensordict import NestedKey
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec
@@ -76,7 +76,9 @@ class Requirements:
         return [] if self.hazard_key is None else [self.hazard_key]
 
 
-def check_environment(env: EnvBase, architecture: Architecture, *, builder: str, levels: int) -> Requirements:
+def check_environment(
+    env: EnvBase, architecture: Architecture, *, builder: str, levels: int, discovered: SubgoalSet | None = None
+) -> Requirements:
     """Checks the specs of an environment and collects what a builder needs to know.
 
     Args:
@@ -84,6 +86,7 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
         architecture: the networks that will read the observation.
         builder: name of the builder, for the error.
         levels: number of the agent's levels; it pursues the task's last ``levels - 1`` sets of subgoals.
+        discovered: the set that the agent finds itself, and pursues in their place.
 
     Raises:
         ValueError: with everything that is missing or wrong and what the environment has, or if the task has too few
@@ -100,6 +103,8 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
     if not isinstance(architecture, Architecture):
         raise ValueError(f"architecture must be an Architecture, got {architecture!r}; use compact_network().")
     entries, task = Entries.of(env), task_of(env)
+    if discovered is not None:
+        task = replace(task, subgoals=(discovered,), ordered=False)
     _check_levels(levels, task)
     _check_batch(entries)
     _check_resets(env, entries)
@@ -110,11 +115,8 @@ def check_environment(env: EnvBase, architecture: Architecture, *, builder: str,
     entries.require_number(keys.REWARD)
     if levels > 1:
         entries.require_number(keys.EXTRINSIC_REWARD)
-    subgoals = _subgoals(entries, task, levels - 1)
-    available = tuple(each.keys.available if each.keys.available in entries else None for each in subgoals)
-    for each, available_key in zip(subgoals, available, strict=True):
-        if available_key is not None:
-            entries.require_flags(available_key, len(each))
+    subgoals = _subgoals(entries, task, levels - 1) if discovered is None else (discovered,)
+    available = _available(entries, subgoals) if discovered is None else (discovered.keys.available,)
     for key in (keys.HAZARD, keys.SUCCESS):
         if key in entries and (levels > 1 or key == keys.SUCCESS):
             entries.require_flags(key)
@@ -163,6 +165,15 @@ def _subgoals(entries: Entries, task: Task, number: int) -> tuple[SubgoalSet, ..
     entries.require_flags(keys.ATTAINED, None)
     size = entries.specs[keys.ATTAINED].shape[-1] if keys.ATTAINED in entries else 0
     return (SubgoalSet(names=tuple(f"subgoal {index}" for index in range(size))),) if size else ()
+
+
+def _available(entries: Entries, subgoals: tuple[SubgoalSet, ...]) -> tuple[NestedKey | None, ...]:
+    """For each set, the entry that marks the subgoals worth choosing, or ``None``, after checking it."""
+    available = tuple(each.keys.available if each.keys.available in entries else None for each in subgoals)
+    for each, available_key in zip(subgoals, available, strict=True):
+        if available_key is not None:
+            entries.require_flags(available_key, len(each))
+    return available
 
 
 def _check_batch(entries: Entries) -> None:

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import replace
 from typing import Literal
 
 from tensordict import NestedKey
@@ -23,10 +21,12 @@ from hdrqn_torchrl.algorithms.base import (
     stored_states,
 )
 from hdrqn_torchrl.algorithms.books import make_books
+from hdrqn_torchrl.algorithms.discovering import finding_subgoals, finds_subgoals
 from hdrqn_torchrl.algorithms.requirements import Requirements, check_environment
+from hdrqn_torchrl.algorithms.v3_sequences import check_learner, with_sequences
 from hdrqn_torchrl.algorithms.views import views_of
-from hdrqn_torchrl.data import FROM_STARTS, StepSelector
-from hdrqn_torchrl.envs import Task
+from hdrqn_torchrl.data import StepSelector
+from hdrqn_torchrl.discovery import DiscoverySettings, discovered_set
 from hdrqn_torchrl.learning import Learner, LearnerSettings, PhaseOne, phase_monitors
 from hdrqn_torchrl.modules import (
     AllSubgoalsNetwork,
@@ -38,17 +38,14 @@ from hdrqn_torchrl.modules import (
 from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import AllSubgoalsLoss
 
-LONGEST_SEQUENCE = 200
-"""Longest episode, in steps, that v3 replays as a whole by default."""
-SHORT_SEQUENCE = 32
-"""Default length, in steps, of sequences that begin anywhere; v3 learned Montezuma's Revenge with it."""
-
 
 def make_v3(
     env: EnvBase,
     architecture: Architecture,
     *,
     levels: int = 2,
+    subgoals: Literal["given", "discovered"] = "given",
+    discovery: DiscoverySettings = DiscoverySettings(),  # noqa: B008 (frozen)
     total_frames: int | None = None,
     learner: LearnerSettings = presets.V3_LEARNER,
     sub_exploration: EpsilonGreedy | None = None,
@@ -83,6 +80,9 @@ def make_v3(
         levels: number of levels. The agent pursues the last ``levels - 1`` sets of subgoals that the task states
             (:class:`~hdrqn_torchrl.envs.Task`). 1: a flat agent with the same memory and loss, which learns from the
             task's total reward.
+        subgoals: ``"given"``: those of the task; ``"discovered"``: the agent finds them itself, in what it sees, does
+            and is paid, and reads nothing that the environment says about subgoals (docs/discovery.md).
+        discovery: how it finds them.
         total_frames: environment frames of the whole training, in which the learning rates fall; ``None``: as the
             settings have it (``learning_rate_frames``).
         learner: how it learns. Without ``stored_state``, ``sampling`` must be ``"episode_starts"`` or
@@ -124,7 +124,7 @@ def make_v3(
         >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['joint']
     """
-    _check_learner(learner)
+    check_learner(learner)
     if joint and meta_learning_rate is not None:
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
     if phase_one is not None and levels == 1:
@@ -133,8 +133,10 @@ def make_v3(
         raise ValueError(
             f"bonus_reward must be 0 with levels={levels}, got {bonus_reward}; their critic already rewards subgoals."
         )
-    has = check_environment(env, architecture, builder="make_v3", levels=levels)
-    learner = _with_sequences(learner.lasting(total_frames), has.task)
+    finds = finds_subgoals(subgoals, levels=levels, phase_one=phase_one)
+    own = discovered_set(discovery.max_subgoals) if finds else None
+    has = check_environment(env, architecture, builder="make_v3", levels=levels, discovered=own)
+    learner = with_sequences(learner.lasting(total_frames), has.task)
     sub_exploration = sub_exploration or presets.v3_sub_exploration()
     meta_exploration = meta_exploration or presets.meta_exploration()
     policy = AllSubgoalsPolicy(
@@ -174,7 +176,7 @@ def make_v3(
         trained = Learner(
             policy,
             learner,
-            extract=_make_extract(loss, stored_states(policy, learner)),
+            extract=_make_extract(loss, stored_states(policy, learner), [keys.EVENTS] if finds else []),
             loss=loss,
             num_envs=has.num_envs,
             episode_len=has.task.max_steps,
@@ -188,7 +190,7 @@ def make_v3(
         wrong_subgoal_reward=wrong_subgoal_reward,
     )
     explorations = [sub_exploration, *policy.subgoal_explorations]
-    return Algorithm(
+    algorithm = Algorithm(
         policy=policy,
         learners={"joint": trained},
         explorations={level.name: each for level, each in zip(has.levels, explorations, strict=True)},
@@ -197,25 +199,7 @@ def make_v3(
         levels=views_of(has.levels, action_mask_key=has.action_mask_key),
         monitors=phase_monitors(phase_one, has.subgoals, explorations[1:]),
     )
-
-
-def _check_learner(learner: LearnerSettings) -> None:
-    """Refuses settings that have no meaning for v3, or another one."""
-    if learner.sampling not in FROM_STARTS and not learner.stored_state:
-        raise ValueError(
-            f"learner.sampling must be one of {FROM_STARTS} for v3 without stored_state, got {learner.sampling!r}: its "
-            "memory lasts a whole episode and would start empty in mid-episode; use one of them, or stored_state=True."
-        )
-    if learner.trace_decay or learner.n_step > 1:
-        raise ValueError(
-            f"learner.trace_decay and n_step must be left at 0 and 1 for v3, got {learner.trace_decay} and "
-            f"{learner.n_step}; use v3's own argument trace_decay."
-        )
-    if learner.max_target is not None:
-        raise ValueError(
-            f"learner.max_target must be None for v3, got {learner.max_target}; the meta level's targets are bounded "
-            "by max_meta_target, those of the other levels by the reward for reaching the subgoal."
-        )
+    return finding_subgoals(algorithm, has, discovery) if finds else algorithm
 
 
 def _make_network(
@@ -246,13 +230,13 @@ def _make_network(
     )
 
 
-def _make_extract(loss: AllSubgoalsLoss, states: list[NestedKey]) -> StepSelector:
+def _make_extract(loss: AllSubgoalsLoss, states: list[NestedKey], events: list[NestedKey]) -> StepSelector:
     """Stores what the loss reads, each observation only once: the next step's observation is the step's outcome."""
     after = [key[1] for key in loss.in_keys if isinstance(key, tuple) and key[0] == "next"]
     root = [key for key in loss.in_keys if not (isinstance(key, tuple) and key[0] == "next")]
     return StepSelector(
         root_keys=list(dict.fromkeys([*root, *states])),
-        next_keys=[key for key in after if key not in (keys.DONE, keys.TERMINATED)],
+        next_keys=[*(key for key in after if key not in (keys.DONE, keys.TERMINATED)), *events],
     )
 
 
@@ -261,30 +245,3 @@ def _largest_return(has: Requirements, bonus_reward: float) -> float:
     if has.subgoals:
         return has.task.largest_extrinsic_return
     return math.inf if bonus_reward else has.task.largest_return
-
-
-def _with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
-    """The settings with a ``slice_len`` that suits the task, if they have none.
-
-    Raises:
-        ValueError: if ``sampling="whole_episodes"`` and episodes may be too long.
-    """
-    if learner.slice_len is not None:
-        return learner
-    if learner.sampling not in FROM_STARTS:
-        return replace(learner, slice_len=SHORT_SEQUENCE)
-    if task.max_steps is not None and task.max_steps <= LONGEST_SEQUENCE:
-        return replace(learner, slice_len=task.max_steps)
-    length = "of unknown length" if task.max_steps is None else f"of up to {task.max_steps} steps"
-    if learner.sampling == "whole_episodes":
-        raise ValueError(
-            f"learner.slice_len must be a number with sampling='whole_episodes' and episodes {length}, got None; give "
-            "one, or use sampling='steps' with stored_state=True."
-        )
-    warnings.warn(
-        f"v3 learns from episodes {length} in sequences of {SHORT_SEQUENCE} steps that begin anywhere, from stored "
-        "states (sampling='steps', stored_state=True, burn_in=0.25); give slice_len for sequences from the start of "
-        "episodes.",
-        stacklevel=3,
-    )
-    return replace(learner, slice_len=SHORT_SEQUENCE, sampling="steps", stored_state=True, burn_in=0.25)

@@ -24,7 +24,8 @@ class LevelView:
         init_key: where it chose, ``[*, 1]`` bool; ``None``: at every step.
         reached_key: whether a step reached what it chose, ``[*, 1]`` bool; ``None`` for actions.
         reward_key: what a step paid it; ``None``: the task's own reward.
-        choice_names: names of what it chooses among; empty for actions, which a scene names.
+        choice_names: names of what it chooses among; empty for actions, which a scene names. Those of subgoals that an
+            agent finds itself change as it finds some.
     """
 
     name: str
@@ -34,7 +35,7 @@ class LevelView:
     init_key: NestedKey | None = None
     reached_key: NestedKey | None = None
     reward_key: NestedKey | None = None
-    choice_names: tuple[str, ...] = ()
+    choice_names: Sequence[str] = ()
 
 
 def views_of(

@@ -30,6 +30,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,7 +90,7 @@ def run(settings: Settings) -> None:
         if settings.out is not None:
             Path(settings.out).write_text(result + "\n")
         if settings.figures is not None:
-            draw(observers, agent.env.base_env, Path(settings.figures))
+            draw(observers, agent, Path(settings.figures))
     except (OSError, ValueError) as error:
         raise SettingsError(f"out and figures must be places that can be written to ({error}).") from error
 
@@ -139,7 +140,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
         "env": agent.config.env,
         "seed": seed,
         "epsilon": settings.epsilon,
-        **summarise(played, names=task.subgoals[-1].names if task.subgoals else ()),
+        **summarise(played, names=names_of(agent)),
         **({"legs": legs_of(observers["legs"])} if "legs" in observers else {}),
         "ceiling": ceiling_of(references, task),
         "references": references,
@@ -173,16 +174,24 @@ def legs_of(legs: LegCounter) -> dict[str, list]:
     return {"options": legs.options.tolist(), "reached": legs.reached.tolist()}
 
 
-def draw(observers: dict[str, Any], base: EnvBase, folder: Path) -> None:
+def names_of(agent: Agent) -> Sequence[str]:
+    """Names of the farthest subgoals: those that the agent pursues or, if it pursues none, the task's."""
+    from hdrqn_torchrl.envs import task_of
+
+    levels, subgoals = agent.algorithm.levels, task_of(agent.env.base_env).subgoals
+    own = tuple(levels[-1].choice_names) if levels else ()
+    return own or (subgoals[-1].names if subgoals else ())
+
+
+def draw(observers: dict[str, Any], agent: Agent, folder: Path) -> None:
     """Writes the pictures."""
     from hdrqn_torchrl.analysis.figures import plot_legs, plot_places
     from hdrqn_torchrl.envs import task_of
-    from hdrqn_torchrl.rendering import scene_of
 
     if "legs" in observers:
         legs = observers["legs"]
-        names = scene_of(base).subgoal_names
-        plot_legs(legs.options.numpy(), legs.reached.numpy(), names, folder / "legs.png")
+        plot_legs(legs.options.numpy(), legs.reached.numpy(), names_of(agent), folder / "legs.png")
+    base = agent.env.base_env
     screen = task_of(base).screen
     if "places" in observers and screen is not None:
         plot_places(observers["places"].counts.numpy(), screen(base), folder / "places.png")

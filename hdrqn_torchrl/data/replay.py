@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
@@ -48,6 +49,15 @@ class SequenceBuffer(TensorDictReplayBuffer):
     def is_full(self) -> bool:
         """Whether what comes next is written over what was stored first."""
         return self._storage._is_full
+
+    def rewrite(self, change: Callable[..., None]) -> None:
+        """Changes what is stored, in place.
+
+        Args:
+            change: takes the stored rows ``[rows, *]`` and, as ``newest``, the number of the one written last.
+        """
+        if len(self):
+            change(self._storage[:], newest=self._storage._last_cursor_index)
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what ``state_dict`` returned.

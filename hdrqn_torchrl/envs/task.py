@@ -199,6 +199,8 @@ def _through(transform: Module, task: Task) -> Task:
         task = task.within(transform.max_steps)
     if isinstance(transform, Critic):
         task = _with_subgoals(task, transform)
+    if callable(restate := getattr(transform, "restated", None)):  # as that of discovered subgoals does
+        task = restate(task)
     written = getattr(transform, "out_keys", [])
     if keys.REWARD in written:
         task = replace(task.without_references(), largest_return=math.inf)

@@ -136,15 +136,11 @@ class Learner:
             ) from error
         if transitions is not None:
             self.buffer.extend(transitions)
-            self._warn_of_longer_episodes(transitions)
+            if self._longer is not None and self._longer.seen(transitions):
+                self._longer = None  # once is enough
+                warn_longer(self.settings)
         if self._frames_owed > 0 and (self.held or not self._can_draw()):
             self._warm_at += math.ceil(self._frames_owed)
-
-    def _warn_of_longer_episodes(self, transitions: TensorDictBase) -> None:
-        """Warns once that an episode has transitions that no sequence from its start will ever show."""
-        if self._longer is not None and self._longer.seen(transitions):
-            self._longer = None
-            warn_longer(self.settings)
 
     @property
     def _frames_owed(self) -> float:
@@ -265,7 +261,7 @@ class Learner:
                 "and is warmed up again, so that the training goes on, but not bit for bit as it would have.",
                 stacklevel=3,
             )
-            self._begin_empty()
+            self.begin_empty()
             return
         self.buffer.load_state_dict(state["buffer"])
         self._drawn, self._warm_at = list(state["drawn"]), state["warm_at"]
@@ -278,8 +274,6 @@ class Learner:
         """
         check_counters(state, self.settings)
         self._continuity.reset()
-        if self._captured is not None:
-            self._captured.reset()
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_state_dict(state["loss"])
         self.extract.load_state_dict(state["extract"])
@@ -287,12 +281,19 @@ class Learner:
         if "buffer" in state:
             self.load_memory_state_dict(state)
         else:
-            self._begin_empty()
+            self.begin_empty()
         if self.settings.precision == "auto":  # another machine might choose another one
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
 
-    def _begin_empty(self) -> None:
+    def rewrite(self, change: Callable[..., None]) -> None:
+        """Changes stored transitions (:meth:`SequenceBuffer.rewrite`); minibatches drawn before are drawn anew."""
+        self.buffer.rewrite(change)
+        self._drawn = []
+
+    def begin_empty(self) -> None:
         """Empties the memory; updates wait until it is warm again."""
+        if self._captured is not None:
+            self._captured.reset()
         if len(self.buffer):
             self.buffer.empty()
         done = math.ceil(self.updates * self.settings.frames_per_update)

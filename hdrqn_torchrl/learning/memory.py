@@ -77,7 +77,7 @@ def warn_longer(settings: LearnerSettings) -> None:
         f"slice_len should cover an episode with sampling={settings.sampling!r}, got {settings.slice_len} where one "
         "has more transitions; the later ones are never learned from: raise slice_len, or use sampling='steps' with "
         "stored_state=True.",
-        stacklevel=5,
+        stacklevel=4,
     )
 
 

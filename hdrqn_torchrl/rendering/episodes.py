@@ -121,7 +121,7 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int, max_s
 def _pursue(above: Sequence[LevelView], now: TensorDictBase, before: Sequence[Pursuit]) -> tuple[Pursuit, ...]:
     """The subgoals in force, those chosen in this very step ``[]`` included."""
     return tuple(
-        Pursuit(view.name, view.choice_names, _decision(view, now)) if now[view.init_key] else before[place]
+        Pursuit(view.name, tuple(view.choice_names), _decision(view, now)) if now[view.init_key] else before[place]
         for place, view in enumerate(above)
     )
 

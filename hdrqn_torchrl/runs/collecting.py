@@ -39,7 +39,8 @@ def make_collector(
         allowed: see :func:`~hdrqn_torchrl.runs.building.build`.
 
     Raises:
-        ValueError: if the worlds can't be divided among the workers.
+        ValueError: if the worlds can't be divided among the workers, or the agent finds its subgoals itself and there
+            are workers.
         SettingsError: if there is no Ray, or no cluster of it.
     """
     chosen, worlds = settings.collector, env.batch_size[0]
@@ -60,6 +61,11 @@ def make_collector(
             auto_register_policy_transforms=False,
         )
     check_workers(chosen.workers, worlds)
+    if "discovery" in algorithm.monitors:
+        raise ValueError(
+            f"collector must be local with algo.subgoals=discovered, got {chosen.kind}: workers would not learn what "
+            "is found; leave collector out."
+        )
     make = partial(
         Worker,
         partial(worker_part, settings, tuple(allowed), worlds // chosen.workers),

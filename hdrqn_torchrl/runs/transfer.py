@@ -75,7 +75,8 @@ class _Captured:
 
 @torch.no_grad()
 def start_from(algorithm: Algorithm, weights: Weights) -> None:
-    """Copies weights into an agent's networks and target networks; exploration, counters and memories stay new.
+    """Copies weights into an agent's networks and target networks, and the subgoals that it has found, if it finds
+    them itself; exploration, counters and memories stay new.
 
     Args:
         algorithm: an agent that has not been trained.
@@ -84,7 +85,8 @@ def start_from(algorithm: Algorithm, weights: Weights) -> None:
     Raises:
         ValueError: if they have others, naming the first of them; nothing is copied then.
     """
-    wanted = dict(algorithm.policy.named_parameters())
+    found_itself = {name: each for name, each in algorithm.policy.named_buffers() if name.startswith("critic.")}
+    wanted = {**dict(algorithm.policy.named_parameters()), **found_itself}
     found = {name: value for name, value in weights.items() if name in wanted or not _is_of_exploration(name)}
     differing = [
         f"{name} is {_shape(found.get(name))} there and {_shape(wanted.get(name))} here"

@@ -27,6 +27,7 @@ BUILDERS = {
         "hdrqn_torchrl.algorithms.make_v3",
     ),
     "algo.*": (
+        "hdrqn_torchrl.discovery.DiscoverySettings",
         "hdrqn_torchrl.learning.LearnerSettings",
         "hdrqn_torchrl.modules.EpsilonGreedy",
         "hdrqn_torchrl.modules.RepeatingEpsilonGreedy",
@@ -73,6 +74,7 @@ LARGEST = {
     "batch_size": 100_000,
     "capacity": 20_000_000,
     "window": 100_000,
+    "max_subgoals": 256,
 }
 """Sizes that something is made of; larger ones are mistakes, or meant to fill the memory of whoever opens a run."""
 _LARGEST_NUMBER, _LONGEST_LIST = 10**18, 64  # of whole numbers of any other kind, and of lists of sizes

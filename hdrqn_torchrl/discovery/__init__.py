@@ -1,0 +1,20 @@
+"""Subgoals that an agent finds itself, in the changes of what it sees that its movements do not explain."""
+
+from hdrqn_torchrl.discovery.critic import DiscoveredSubgoals, EventCritic, discovered_set
+from hdrqn_torchrl.discovery.monitor import Discovery
+from hdrqn_torchrl.discovery.relabelling import relabel
+from hdrqn_torchrl.discovery.selection import Chosen, Selection
+from hdrqn_torchrl.discovery.settings import DiscoverySettings
+from hdrqn_torchrl.discovery.table import SubgoalTable
+
+__all__ = [
+    "Chosen",
+    "DiscoveredSubgoals",
+    "Discovery",
+    "DiscoverySettings",
+    "EventCritic",
+    "Selection",
+    "SubgoalTable",
+    "discovered_set",
+    "relabel",
+]

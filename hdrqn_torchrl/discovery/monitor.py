@@ -1,0 +1,91 @@
+"""Finds subgoals while an agent is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+
+from hdrqn_torchrl import keys
+from hdrqn_torchrl.discovery.critic import EventCritic
+from hdrqn_torchrl.discovery.relabelling import relabel
+from hdrqn_torchrl.discovery.selection import Selection
+from hdrqn_torchrl.discovery.settings import DiscoverySettings
+from hdrqn_torchrl.learning import Learner
+
+
+class Discovery:
+    """Teaches the detector, asks for subgoals from time to time, and tells stored steps anew. (A monitor.)
+
+    1. The detector learns from all steps until it is ready. Events of the steps up to then are unknown, so memories
+       forget them, and warm up again.
+    2. Every ``discovery_frames`` the selection is asked which events are subgoals; stored steps are relabelled
+       (:func:`~hdrqn_torchrl.discovery.relabel`), so that new heads learn at once from all that was seen.
+
+    A head whose slot gets another event is left as it is: it learns the new one from stored steps within a few hundred
+    updates, and what all heads have in common serves it, too.
+
+    Args:
+        critic: of the agent.
+        selection: chooses.
+        learners: whose memories are relabelled.
+        settings: when.
+    """
+
+    def __init__(
+        self, critic: EventCritic, selection: Selection, learners: Sequence[Learner], settings: DiscoverySettings
+    ) -> None:
+        self.critic, self.selection, self.learners, self.settings = critic, selection, learners, settings
+        self.frames = 0
+        self.found: list[int] = [0] * critic.table.num_subgoals
+        """Frames at which each subgoal was found; 0: there is none."""
+
+    def observe(self, batch: TensorDictBase) -> None:
+        """Takes in a collected batch ``[N, T]``, after learners have stored it."""
+        before, self.frames = self.frames, self.frames + batch.numel()
+        if not self.critic.detector.ready:
+            self._teach(batch)
+            return
+        self.selection.observe(batch)
+        interval = self.settings.discovery_frames
+        if self.frames // interval > before // interval and self.frames <= self.settings.until_frames:
+            self._discover()
+
+    def _teach(self, batch: TensorDictBase) -> None:
+        """Shows the detector a batch; once that is ready, memories forget what was stored."""
+        after = batch.get("next").get(keys.OBSERVATION)
+        self.critic.detector.observe(batch.get(keys.OBSERVATION), batch.get(keys.ACTION), after)
+        if self.critic.detector.ready:
+            for learner in self.learners:
+                learner.begin_empty()
+
+    def _discover(self) -> None:
+        table, chosen = self.critic.table, self.selection.update(self.frames)
+        before = table.tokens.clone(), table.slots.clone(), table.once.clone()
+        kept = table.assign(chosen.slots, once=chosen.once)
+        if all(torch.equal(old, new) for old, new in zip(before, (table.tokens, table.slots, table.once), strict=True)):
+            return
+        for subgoal, (was, used) in enumerate(zip(kept.tolist(), table.in_use.tolist(), strict=True)):
+            self.found[subgoal] = self.found[subgoal] if was else self.frames if used else 0
+        for learner in self.learners:
+            learner.rewrite(partial(relabel, table=table, kept=kept))
+
+    def metrics(self) -> dict[str, float]:
+        """Number of subgoals, and when each was found (0: the slot is free)."""
+        found = {f"discovery/found_{slot}": frames for slot, frames in enumerate(self.found) if slot}
+        return {"discovery/subgoals": sum(map(bool, self.found)), **found}
+
+    def clear(self) -> None:
+        """Nothing starts again with a row."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """What it has counted; the critic is a part of the policy."""
+        return {"frames": self.frames, "found": list(self.found), "selection": self.selection.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self.frames, self.found = state["frames"], list(state["found"])
+        self.selection.load_state_dict(state["selection"])
