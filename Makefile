@@ -19,7 +19,7 @@ train: setup
 	$(BIN)/python train.py env=gridworld algo=v2 $(ARGS)
 
 test: setup lint
-	$(BIN)/python -m pytest -m 'not slow' -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -m 'not slow' -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow $(ARGS)

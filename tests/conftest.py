@@ -8,6 +8,17 @@ import torch
 from matplotlib.figure import Figure
 
 torch.set_num_threads(1)
+LONGEST = (
+    "test_launchers", "test_resume", "test_sweeps", "test_train", "test_ray", "test_ray_cluster", "test_algorithms",
+    "test_learning", "test_report", "test_captured", "test_captured_collector", "test_hostile_runs",
+    "test_gym_environment", "test_random_settings", "test_faults", "test_processes",
+)  # fmt: skip
+"""Files of tests that take ten seconds or more."""
+
+
+def pytest_collection_modifyitems(items):
+    """The longest files come first, so that processes which share the files (``make test``) end together."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
 
 
 @pytest.fixture(scope="session", autouse=True)
