@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hdrqn_torchrl.analysis.results import Run
-from hdrqn_torchrl.runs.comparing import NOT_COMPARED, NOT_THE_TASK, flat
+from hdrqn_torchrl.runs.comparing import NOT_COMPARED, NOT_THE_TASK, NOT_THE_WORLDS, flat
 
 NONE = "none"
 """Label of a setting that a run does not have."""
@@ -71,7 +71,15 @@ def rows_of(entries: Sequence[Entry], by: Sequence[str] = ("algo",), *, pool: bo
 def task_of(entry: Entry) -> dict[str, Any]:
     """The settings of the environment that make a run's task."""
     env = entry.settings.get("env") or {}
-    return {key: value for key, value in env.items() if key not in NOT_THE_TASK}
+    without = NOT_THE_TASK if id_of(entry.settings) is None else (*NOT_THE_TASK, *NOT_THE_WORLDS)
+    return {key: value for key, value in env.items() if key not in without}
+
+
+def id_of(settings: dict[str, Any]) -> str | None:
+    """The id that names the task of ``env=gym`` and ``env=minigrid``; ``None`` for tasks that have none."""
+    env = settings.get("env")
+    found = env.get("id") if isinstance(env, dict) else None
+    return found if isinstance(found, str) else None
 
 
 def task_key(entry: Entry, without: Set[str] = frozenset()) -> str:
@@ -81,7 +89,7 @@ def task_key(entry: Entry, without: Set[str] = frozenset()) -> str:
 
 
 def value_of(entry: Entry, key: str) -> str:
-    """Value of a setting, or name of the chosen file of conf/, as text.
+    """Value of a setting, or name of the chosen file of conf/, as text; of ``env`` the task's id, if it has one.
 
     Examples:
         >>> from pathlib import Path
@@ -89,6 +97,8 @@ def value_of(entry: Entry, key: str) -> str:
         >>> [value_of(entry, key) for key in ("algo", "algo.sub.slice_len", "algo.nothing")]
         ['v2', '8', 'none']
     """
+    if key == "env" and (id := id_of(entry.settings)) is not None:
+        return id
     if key in entry.choices:
         return _text(entry.choices[key])
     value: Any = entry.settings
@@ -111,9 +121,10 @@ def differences(entries: Sequence[Entry]) -> list[str]:
 
 
 def _compared(settings: dict[str, Any]) -> dict[str, Any]:
-    """By full names; of the environment only how many worlds there are, as the rest of it is the task."""
+    """By full names; of the environment only what does not belong to the task, such as how many worlds there are."""
     found = flat(settings, without=NOT_COMPARED)
-    return {key: value for key, value in found.items() if not key.startswith("env.") or key == "env.num_envs"}
+    kept = ["env.num_envs", *(f"env.{name}" for name in NOT_THE_WORLDS if id_of(settings) is not None)]
+    return {key: value for key, value in found.items() if not key.startswith("env.") or key in kept}
 
 
 def _labels(entries: Sequence[Entry], by: Sequence[str]) -> list[str]:

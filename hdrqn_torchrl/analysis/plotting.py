@@ -18,6 +18,7 @@ _PANELS = (
     ("extrinsic", "extrinsic reward of an episode"),
     ("steps", "steps of an episode"),
 )
+_SOURCES: dict[str, dict] = {"behaviour": {"alpha": 0.5}, "greedy": {"marker": ".", "linewidth": 2}}
 
 
 def plot_run(
@@ -29,16 +30,20 @@ def plot_run(
 ) -> None:
     """Draws the paper's four curves (reward, intrinsic, extrinsic, steps) of one run over environment frames.
 
+    Those that the run has no values of are left out, as intrinsic rewards of flat agents.
+
     Args:
         metrics: columns as :func:`~hdrqn_torchrl.analysis.results.read_metrics` returns them.
         path: picture to write; its ending chooses the format.
         title: heading.
         references: scripted players by name, each with ``return_mean`` and ``steps_mean``, drawn as dashed lines.
     """
-    figure = Figure(figsize=(4 * len(_PANELS), 3.4), layout="constrained")
-    axes = figure.subplots(1, len(_PANELS))
-    for axis, (name, label) in zip(axes, _PANELS, strict=True):
-        for source, style in (("behaviour", {"alpha": 0.5}), ("greedy", {"marker": ".", "linewidth": 2})):
+    panels = [panel for panel in _PANELS if any(_points(metrics, f"{source}/{panel[0]}") for source in _SOURCES)]
+    panels = panels or [_PANELS[0]]
+    figure = Figure(figsize=(4 * len(panels), 3.4), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axis, (name, label) in zip(axes, panels, strict=True):
+        for source, style in _SOURCES.items():
             _curve(axis, metrics, f"{source}/{name}", source, style)
         _reference_lines(axis, references or {}, f"{name}_mean")
         axis.set(xlabel="environment frames", title=label)
@@ -58,7 +63,10 @@ def _reference_lines(axis: Axes, references: References, name: str) -> None:
             axis.annotate(player, at, xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
 
 
+def _points(metrics: Metrics, column: str) -> list[tuple[float, float]]:
+    return [(x, y) for x, y in zip(metrics.get("frames", []), metrics.get(column, []), strict=False) if y == y]
+
+
 def _curve(axis: Axes, metrics: Metrics, column: str, label: str, style: dict) -> None:
-    points = [(x, y) for x, y in zip(metrics.get("frames", []), metrics.get(column, []), strict=False) if y == y]
-    if points:
+    if points := _points(metrics, column):
         axis.plot(*zip(*points, strict=True), label=label, **style)

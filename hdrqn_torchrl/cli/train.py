@@ -187,14 +187,19 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players:
         seed=run.config.evaluation.seed + 1,
         max_steps=run.config.evaluation.max_steps,
     )
-    groups = (f"{name}={run.choices[name]}" for name in ("env", "algo", "network") if name in run.choices)
-    title = " ".join([*groups, f"seed={run.config.seed}"])
     summary = folder.write_summary(run.folder, trainer, result, ceiling=trainer.ceiling())
     references = players()  # all of them only now: neither training nor its result need wait
     with replaced(run.folder / layout.CURVES) as picture:
-        plot_run(read_metrics(run.folder / layout.METRICS), picture, title=title, references=references)
+        plot_run(read_metrics(run.folder / layout.METRICS), picture, title=title_of(run), references=references)
     print(json.dumps({"run": str(run.folder), **summary}))
     return summary
+
+
+def title_of(run: Plan) -> str:
+    """What a run was composed from, with the id of its task, for its figure."""
+    groups = {name: f"{name}={run.choices[name]}" for name in ("env", "algo", "network") if name in run.choices}
+    id = run.config.env.get("id")
+    return " ".join([*groups.values(), *([] if id is None else [f"id={id}"]), f"seed={run.config.seed}"])
 
 
 def build_run(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:

@@ -23,6 +23,8 @@ NOT_COMPARED = (*NOT_LEARNED_FROM, "seed", "evaluation")
 """Runs that differ in these may be averaged."""
 NOT_THE_TASK = ("num_envs", "seed", "device")
 """Settings of the environment that leave the task as it is."""
+NOT_THE_WORLDS = ("subgoals", "backend", "processes")
+"""Those that leave a task as it is which an id names: what agents are told of it, and where its worlds run."""
 
 
 def flat(settings: Any, *, without: Collection[str] = (), path: str = "") -> dict[str, Any]:

@@ -147,6 +147,15 @@ def test_tasks_are_rows_and_groups_keep_their_colour(tmp_path, figures):
     assert legend_of(figures[0])[:2] == ["dqn (1 seed)", "v2 (1 to 2 seeds)"]
 
 
+def test_a_panel_without_values_has_no_scale(tmp_path, figures):
+    tasks = [
+        TaskResults("gridworld", [group("v2", [run_of(greedy__steps=[3.0, 2.0, 1.0])])]),
+        TaskResults("maze", [group("dqn", [run_of()])]),
+    ]
+    plot_curves(tasks, [tmp_path / "a.png"], panels=[GREEDY[0], GREEDY[3]])
+    assert [len(axis.get_xticks()) > 0 for axis in figures[0].axes] == [True, True, True, False]
+
+
 def test_many_groups_never_look_the_same(tmp_path, figures):
     plot_curves(
         one_task(*(group(str(index), [run_of(index)]) for index in range(20))), [tmp_path / "a.png"], panels=GREEDY[:1]

@@ -107,6 +107,28 @@ class TestTasks:
         assert task_key(entry(env={key: 1})) == task_key(entry(env={key: 2}))
         assert len(rows_of([entry(env={key: 1}), entry(env={key: 2})], [])) == 1
 
+    def test_tasks_of_ids_are_called_by_them_whatever_subgoals_agents_are_given(self):
+        def run(id, algo, **settings):
+            return entry(choices={"env": "gym", "algo": algo}, env={"id": id, "subgoals": None, **settings})
+
+        mine = {"subgoals": "my_package.Mine", "backend": "envpool"}
+        entries = [
+            run("Key-v0", "drqn"),
+            run("Key-v0", "v3", **mine),
+            run("Maze-v0", "v3"),
+            run("Maze-v0", "v3", max_steps=9),
+        ]
+        assert labels(entries, "algo") == {
+            "Key-v0": ["drqn", "v3"],
+            "Maze-v0, max_steps=9": ["v3"],
+            "Maze-v0, max_steps=none": ["v3"],
+        }
+        assert labels(entries[:3], "env") == {"Key-v0 + Maze-v0": ["Key-v0", "Maze-v0"]}
+        assert {"env.subgoals", "env.backend"} <= set(differences(entries[:2]))
+
+    def test_subgoals_are_part_of_a_task_without_an_id(self):
+        assert task_key(entry(env={"subgoals": ["key"]})) != task_key(entry(env={"subgoals": ["door"]}))
+
     def test_groups_of_a_setting_of_the_environment_share_their_row(self):
         entries = [entry(env={"view": view, "num_goals": goals}) for view in (3, 5) for goals in (2, 3)]
         assert labels(entries, "env.view") == {

@@ -20,13 +20,18 @@ def lines(axis):
 
 def test_curves_skip_the_gaps_and_references_are_dashed(tmp_path, figures):
     plot_run(METRICS, tmp_path / "curves.png", title="a run", references=REFERENCES)
-    returns, _, _, steps = figures[0].axes
+    returns, steps = figures[0].axes
     assert lines(returns) == {"behaviour": [[100.0, 0.5], [200.0, 0.75]], "greedy": [[0.0, 0.25], [200.0, 1.0]]}
     assert lines(steps) == {"greedy": [[0.0, 50.0], [200.0, 20.0]]}
     dashed = [line.get_ydata()[0] for line in returns.get_lines() if line.get_linestyle() == "--"]
     assert dashed == [2.0, -0.35]
     assert {text.get_text() for text in returns.texts} == {"memory", "random"}
     assert figures[0].get_suptitle() == "a run"
+
+
+def test_a_quantity_without_values_has_no_panel(tmp_path, figures):
+    plot_run(METRICS | {"greedy/intrinsic": [math.nan] * 3}, tmp_path / "curves.png")
+    assert [axis.get_title() for axis in figures[0].axes] == ["total reward of an episode", "steps of an episode"]
 
 
 def test_the_picture_is_written_without_pyplots_global_state(tmp_path):

@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from functools import cache, partial
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -550,3 +551,10 @@ def poison_updates():
         return drawn
 
     Learner.sample = poisoned_sample
+
+
+def test_a_figure_s_title_names_the_task_by_its_id():
+    run = SimpleNamespace(
+        choices={"env": "gym", "algo": "drqn"}, config=SimpleNamespace(env={"id": "CartPole-v1"}, seed=3)
+    )
+    assert train.title_of(run) == "env=gym algo=drqn id=CartPole-v1 seed=3"

@@ -85,6 +85,8 @@ def plot_curves(
             else:
                 place.xaxis.set_major_locator(MaxNLocator(6))
             place.xaxis.set_major_formatter(EngFormatter(sep=""))
+            if not place.has_data():
+                place.set(xticks=[], yticks=[])
     handles = [_group_handle(with_seeds(label, tasks), style, panels) for label, style in styles.items()]
     explained = [*_meaning_handles(panels), *reference_handles(tasks, panels)]
     add_legend(figure, handles, explained, caption_of(tasks, center))
