@@ -18,7 +18,7 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import open_dict
 
-from hdrqn_torchrl.cli.command_line import overrides_last
+from hdrqn_torchrl.cli.command_line import overrides_last, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, resolved
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.building import build, build_env
@@ -35,7 +35,8 @@ def main() -> None:
         print(as_called((__doc__ or "").strip()))
         return
     try:
-        found = check_settings(composed(arguments))
+        with results_alone():
+            found = check_settings(composed(arguments))
     except ValueError as error:  # also of the environment's own parts, such as a critic
         sys.exit(f"error: {error}")
     print("\n".join(found))

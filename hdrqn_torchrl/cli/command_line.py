@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, TextIO, get_type_hints
 
 from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -32,6 +34,25 @@ def check_place(path: Path, key: str) -> None:
             raise IsADirectoryError("it is a folder")
     except OSError as error:
         raise SettingsError(f"{key} must be a file that can be written, got {str(path)!r} ({error}).") from error
+
+
+_RESULTS: ContextVar[TextIO | None] = ContextVar("results", default=None)
+
+
+@contextlib.contextmanager
+def results_alone() -> Iterator[None]:
+    """Leaves the standard output to :func:`print_result`: what worlds print meanwhile goes to the error output."""
+    before = _RESULTS.set(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _RESULTS.reset(before)
+
+
+def print_result(text: str) -> None:
+    """Prints to the standard output, also inside of :func:`results_alone`."""
+    print(text, file=_RESULTS.get(), flush=True)
 
 
 def overrides_last(arguments: Sequence[str]) -> list[str]:

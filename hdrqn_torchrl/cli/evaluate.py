@@ -27,7 +27,6 @@ them (on the grids: "memory", which has the agent's own view; "egocentric" must 
 
 from __future__ import annotations
 
-import contextlib
 import json
 import sys
 from collections.abc import Sequence
@@ -37,7 +36,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import MISSING
 
-from hdrqn_torchrl.cli.command_line import check_place, command_line
+from hdrqn_torchrl.cli.command_line import check_place, command_line, results_alone
 from hdrqn_torchrl.runs.arguments import SettingsError
 
 if TYPE_CHECKING:
@@ -82,7 +81,7 @@ def run(settings: Settings) -> None:
         check_place(Path(settings.out), "out")
     if settings.figures is not None:
         check_place(Path(settings.figures) / "legs.png", "figures")
-    with contextlib.redirect_stdout(sys.stderr):  # worlds may print, and only the result belongs there
+    with results_alone():
         played, agent, observers = evaluate_run(settings)
     result = json.dumps(played, indent=2)
     print(result, flush=True)  # first: no later error can lose it

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from hdrqn_torchrl.cli import launchers, sweeps
-from hdrqn_torchrl.cli.command_line import overrides_last
+from hdrqn_torchrl.cli.command_line import overrides_last, print_result, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
@@ -58,9 +58,11 @@ def composed(config: DictConfig) -> float:
         if settings.seeds is not None:
             runs = plans(config, folder)
             load(settings.threads)
-            return train_together(runs, pieces)
+            with results_alone():
+                return train_together(runs, pieces)
         run = plan(settings, folder)
-        return train(run)
+        with results_alone():
+            return train(run)
     except KeyboardInterrupt as stop:
         told = str(stop) or "stopped"
         if config.seeds is None:
@@ -191,7 +193,7 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players:
     references = players()  # all of them only now: neither training nor its result need wait
     with replaced(run.folder / layout.CURVES) as picture:
         plot_run(read_metrics(run.folder / layout.METRICS), picture, title=title_of(run), references=references)
-    print(json.dumps({"run": str(run.folder), **summary}))
+    print_result(json.dumps({"run": str(run.folder), **summary}))
     return summary
 
 

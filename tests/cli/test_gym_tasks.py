@@ -33,12 +33,25 @@ ARGUMENTS = [
 TRUSTED = "allowed_targets=[gym_toys,gym_toys.Milestones]"
 
 
+def talk():
+    """Makes every world print a line in every step."""
+    import gym_toys
+
+    shown = gym_toys.Counter._shown
+    gym_toys.Counter._shown = lambda self: print("a world speaks") or shown(self)
+
+
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    code, _, told = run_script(folder, *ARGUMENTS, *TINY_HDRQN, "hydra.run.dir=run")
+    code, printed, told = run_script(folder, *ARGUMENTS, *TINY_HDRQN, "hydra.run.dir=run", prepare=talk)
     assert code == 0, told
-    return folder / "run"
+    return folder / "run", printed, told
+
+
+@pytest.fixture
+def run(trained):
+    return trained[0]
 
 
 def evaluated(run, monkeypatch, *arguments):
@@ -85,6 +98,11 @@ def test_every_setting_that_imports_is_refused_unless_it_is_allowed(settings):
 def test_entries_of_info_and_known_packages_import_nothing_of_a_users():
     env = {"_target_": "hdrqn_torchrl.envs.make_gym", "id": "ALE/Pong-v5", "package": "ale_py", "success": "is_success"}
     assert imports_of(env) == []
+
+
+def test_worlds_that_print_leave_the_result_of_a_training_alone(trained):
+    _, printed, told = trained
+    assert json.loads(printed)["frames"] >= 1000 and "a world speaks" in told
 
 
 def test_worlds_that_print_leave_the_result_of_an_evaluation_alone(run, monkeypatch, capsys):

@@ -162,9 +162,10 @@ def _silence_babyai() -> None:
     level.print = lambda *_: None
 
 
-def make_world(
-    id: str, settings: Mapping[str, Any], *, what: str = "an environment that Gymnasium knows"
-) -> gymnasium.Env:
+_KNOWN = "an environment that Gymnasium knows"
+
+
+def make_world(id: str, settings: Mapping[str, Any], *, what: str = _KNOWN) -> gymnasium.Env:
     """One world of a registered environment.
 
     Args:
@@ -178,7 +179,8 @@ def make_world(
     try:
         return gymnasium.make(id, **settings)
     except gymnasium.error.Error as error:
-        raise ValueError(f"id must be that of {what}, got {id!r} ({error}).") from error
+        remedy = "; package=my_package (env.package) names the one that registers it" if what is _KNOWN else ""
+        raise ValueError(f"id must be that of {what}, got {id!r} ({error}){remedy}.") from error
     except TypeError as error:
         raise settings_error(id, settings, error) from error
 

@@ -191,7 +191,11 @@ class TestState:
     ("id", "settings", "words"),
     [
         ("CartPole-v1", {"num_envs": 0}, "num_envs must be a whole number >= 1, got 0"),
-        ("NoSuch-v1", {}, "id must be that of an environment that Gymnasium knows, got 'NoSuch-v1'"),
+        (
+            "NoSuch-v1",
+            {},
+            r"id must be that of an environment that Gymnasium knows, got 'NoSuch-v1' .*; package=my_package \(env\.package",
+        ),
         (
             "CartPole-v1",
             {"settings": {"wheels": 4}},
