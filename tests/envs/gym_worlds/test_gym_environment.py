@@ -194,7 +194,7 @@ class TestState:
         (
             "NoSuch-v1",
             {},
-            r"id must be that of an environment that Gymnasium knows, got 'NoSuch-v1' .*; package=my_package \(env\.package",
+            r"that of an environment that Gymnasium knows, got 'NoSuch-v1' .*; package=my_package \(env\.package",
         ),
         (
             "CartPole-v1",
