@@ -1,9 +1,8 @@
 """The order of the package's parts: each imports only from earlier ones."""
 
 import ast
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 import hdrqn_torchrl
 from hdrqn_torchrl.runs import commands, layout
@@ -16,32 +15,49 @@ ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")
 
 
+@cache
+def tree_of(path):
+    return ast.parse(path.read_text())
+
+
+@cache
 def imports_of(path):
     """Full names of all modules that a file imports, wherever in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    found = set()
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "imports are absolute"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+            assert node.level == 0, f"{path}: imports are absolute"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
 
 
 def part_of(path):
     return path.relative_to(ROOT).with_suffix("").parts[0]
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_a_file_imports_only_from_its_own_part_and_earlier_ones(path):
-    rank = ORDER.index(part_of(path))
-    used = {name.split(".")[1] for name in imports_of(path) if name.startswith("hdrqn_torchrl.")} - {"__version__"}
-    assert {part for part in used if ORDER.index(part) > rank} == set()
+def broken(rule, paths=FILES):
+    """What breaks a rule, by file; the rule takes a path and returns it."""
+    found = {str(path.relative_to(ROOT)): rule(path) for path in paths}
+    return {name: wrong for name, wrong in found.items() if wrong}
 
 
-@pytest.mark.parametrize("path", [ROOT / "__init__.py", *FILES], ids=lambda path: str(path.relative_to(ROOT)))
-def test_only_the_programs_import_hydra(path):
-    if path.parent.name == "cli":
-        return
-    assert not {name.split(".")[0] for name in imports_of(path)} & {"hydra", "omegaconf"}
+def test_files_import_only_from_their_own_part_and_earlier_ones():
+    def later(path):
+        rank = ORDER.index(part_of(path))
+        used = {name.split(".")[1] for name in imports_of(path) if name.startswith("hdrqn_torchrl.")} - {"__version__"}
+        return {part for part in used if ORDER.index(part) > rank}
+
+    assert broken(later) == {}
+
+
+def test_only_the_programs_import_hydra():
+    def hydra(path):
+        return {name.split(".")[0] for name in imports_of(path)} & {"hydra", "omegaconf"}
+
+    assert broken(hydra, [ROOT / "__init__.py", *(path for path in FILES if path.parent.name != "cli")]) == {}
+    assert broken(hydra), "the programs do"
 
 
 def test_every_part_of_the_package_has_a_place_in_the_order():
@@ -50,7 +66,7 @@ def test_every_part_of_the_package_has_a_place_in_the_order():
 
 def texts_of(path):
     """All strings in a file's code without docstrings, and the last parts of paths."""
-    tree = ast.parse(path.read_text())
+    tree = tree_of(path)
     docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     return {
         node.value
@@ -59,21 +75,20 @@ def texts_of(path):
     }
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_only_one_module_spells_the_file_names_of_a_run_folder(path):
+def test_only_one_module_spells_the_file_names_of_a_run_folder():
     names = {*layout.WRITTEN, layout.CHECKPOINTS, layout.EVALUATIONS}
-    if path == Path(layout.__file__) or path.name == "configuration.py":  # conf/ has a config.yaml, too
-        return
-    assert not texts_of(path) & names
+    others = [path for path in FILES if path.name != "configuration.py"]  # conf/ has a config.yaml, too
+    assert set(broken(lambda path: texts_of(path) & names, others)) == {"runs/layout.py"}
 
 
 PROGRAMS = {f"hdrqn_torchrl.cli.{name}" for name in commands.PROGRAMS}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_nothing_imports_from_a_program(path):
-    imported = {name if name in PROGRAMS else name.rpartition(".")[0] for name in imports_of(path)}
-    assert not imported & PROGRAMS
+def test_nothing_imports_from_a_program():
+    def programs(path):
+        return {name if name in PROGRAMS else name.rpartition(".")[0] for name in imports_of(path)} & PROGRAMS
+
+    assert broken(programs) == {}
 
 
 def test_no_two_test_files_share_a_name():
