@@ -47,6 +47,12 @@ class Algorithm:
     task: Task = field(default_factory=Task)
 
     @property
+    def found(self) -> list[int] | None:
+        """Frames after which each of its subgoals was found; ``None`` if they were given."""
+        critic = getattr(self.policy, "critic", None)
+        return None if critic is None else critic.table.found.tolist()
+
+    @property
     def updates(self) -> int:
         """Gradient steps of all learners together."""
         return sum(learner.updates for learner in self.learners.values())

@@ -2,9 +2,11 @@
 
     python watch.py run=RUN_DIR out=episode.gif
     python watch.py run=RUN_DIR out=terminal env.layout=four_rooms epsilon=0.1
+    python watch.py run=RUN_DIR out=subgoals.png episodes=50
 
 run              folder of a training
-out              what to write, by ending: .gif or .mp4 (needs PyAV), or terminal to watch at once (default episode.gif)
+out              what to write, by ending: .gif or .mp4 (needs PyAV), or terminal to watch at once (default
+                 episode.gif); .png: a sheet of the agent's subgoals, with moments in which they were attained
 episodes         how many, one after the other (default 3)
 seed             of worlds and exploration; the same seed shows the same episodes (default 0)
 checkpoint       best (default), last, or the path of a checkpoint or weights file
@@ -29,6 +31,7 @@ from hdrqn_torchrl.runs.arguments import SettingsError
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.rendering import Frame
+    from hdrqn_torchrl.runs import Agent
 
 
 @dataclass
@@ -60,8 +63,13 @@ def run(settings: Settings) -> None:
 
     torch.set_num_threads(1)
     try:
-        check_video(path, fps=settings.fps)
-        frames = record(settings)
+        is_sheet = path is not None and path.suffix.lower() == ".png"
+        if not is_sheet:
+            check_video(path, fps=settings.fps)
+        frames, agent = record(settings)
+        if path is not None and is_sheet:
+            write_sheet(frames, path, agent)
+            return
     except ValueError as error:
         raise SettingsError(str(error)) from error
     if path is not None:
@@ -71,8 +79,8 @@ def run(settings: Settings) -> None:
         play_in_terminal(frames, fps=settings.fps)
 
 
-def record(settings: Settings) -> list[Frame]:
-    """What the run's agent does."""
+def record(settings: Settings) -> tuple[list[Frame], Agent]:
+    """What the run's agent does, and the agent."""
     from hdrqn_torchrl.rendering import record_episodes
     from hdrqn_torchrl.runs import load_agent
 
@@ -82,7 +90,7 @@ def record(settings: Settings) -> list[Frame]:
         env_changes=settings.env,
         allowed_targets=settings.allowed_targets,
     )
-    return record_episodes(
+    frames = record_episodes(
         agent.env,
         agent.algorithm,
         episodes=settings.episodes,
@@ -90,6 +98,7 @@ def record(settings: Settings) -> list[Frame]:
         epsilon=settings.epsilon,
         max_steps=agent.config.evaluation.max_steps,
     )
+    return frames, agent
 
 
 def write(frames: list[Frame], path: Path, fps: int) -> None:
@@ -107,6 +116,21 @@ def write(frames: list[Frame], path: Path, fps: int) -> None:
             score = frame.score
             print(f"episode {frame.episode}: {frame.outcome}, return {score.total:.2f}, {score.steps} steps")
     print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB")
+
+
+def write_sheet(frames: list[Frame], path: Path, agent: Agent) -> None:
+    """Writes a picture of the agent's subgoals, as a whole or not at all."""
+    from PIL import Image
+
+    from hdrqn_torchrl.rendering import draw_sheet, subgoal_records
+
+    partial = _partial(path)
+    try:
+        Image.fromarray(draw_sheet(subgoal_records(frames), found=agent.algorithm.found)).save(partial)
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    print(f"{path}: {frames[-1].episode} episodes")
 
 
 def _partial(path: Path) -> Path:

@@ -40,8 +40,6 @@ class Discovery:
     ) -> None:
         self.critic, self.selection, self.learners, self.settings = critic, selection, learners, settings
         self.frames = 0
-        self.found: list[int] = [0] * critic.table.num_subgoals
-        """Frames at which each subgoal was found; 0: there is none."""
 
     def observe(self, batch: TensorDictBase) -> None:
         """Takes in a collected batch ``[N, T]``, after learners have stored it."""
@@ -65,27 +63,26 @@ class Discovery:
     def _discover(self) -> None:
         table, chosen = self.critic.table, self.selection.update(self.frames)
         before = table.tokens.clone(), table.slots.clone(), table.once.clone()
-        kept = table.assign(chosen.slots, once=chosen.once)
+        kept = table.assign(chosen.slots, once=chosen.once, frames=self.frames)
         if all(torch.equal(old, new) for old, new in zip(before, (table.tokens, table.slots, table.once), strict=True)):
             return
-        for subgoal, (was, used) in enumerate(zip(kept.tolist(), table.in_use.tolist(), strict=True)):
-            self.found[subgoal] = self.found[subgoal] if was else self.frames if used else 0
         for learner in self.learners:
             learner.rewrite(partial(relabel, table=table, kept=kept))
 
     def metrics(self) -> dict[str, float]:
         """Number of subgoals, and when each was found (0: the slot is free)."""
-        found = {f"discovery/found_{slot}": frames for slot, frames in enumerate(self.found) if slot}
-        return {"discovery/subgoals": sum(map(bool, self.found)), **found}
+        table = self.critic.table
+        found = {f"discovery/found_{slot}": frames for slot, frames in enumerate(table.found.tolist()) if slot}
+        return {"discovery/subgoals": int(table.in_use.sum()), **found}
 
     def clear(self) -> None:
         """Nothing starts again with a row."""
 
     def state_dict(self) -> dict[str, Any]:
         """What it has counted; the critic is a part of the policy."""
-        return {"frames": self.frames, "found": list(self.found), "selection": self.selection.state_dict()}
+        return {"frames": self.frames, "selection": self.selection.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
-        self.frames, self.found = state["frames"], list(state["found"])
+        self.frames = state["frames"]
         self.selection.load_state_dict(state["selection"])

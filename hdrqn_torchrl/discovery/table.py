@@ -37,6 +37,8 @@ class SubgoalTable(nn.Module):
     """``[M]`` int64: the subgoal that each attains; 0: none."""
     once: Tensor
     """``[G]`` bool: subgoals that an episode attains only once."""
+    found: Tensor
+    """``[G]`` int64: frames after which each got its event."""
 
     def __init__(self, max_subgoals: int, *, max_tokens: int = 256) -> None:
         super().__init__()
@@ -44,6 +46,7 @@ class SubgoalTable(nn.Module):
         self.register_buffer("tokens", torch.full((max_tokens,), _NONE))
         self.register_buffer("slots", torch.zeros(max_tokens, dtype=torch.int64))
         self.register_buffer("once", torch.zeros(max_subgoals + 1, dtype=torch.bool))
+        self.register_buffer("found", torch.zeros(max_subgoals + 1, dtype=torch.int64))
 
     @property
     def num_subgoals(self) -> int:
@@ -60,12 +63,13 @@ class SubgoalTable(nn.Module):
         """Tokens of the events that attain a subgoal, in ascending order."""
         return [] if subgoal == EXPLORE else self.tokens[self.slots == subgoal].tolist()
 
-    def assign(self, slots: Mapping[int, int], *, once: Sequence[int] = ()) -> Tensor:
+    def assign(self, slots: Mapping[int, int], *, once: Sequence[int] = (), frames: int = 0) -> Tensor:
         """Gives all events their slots.
 
         Args:
             slots: subgoal by token; tokens without one attain nothing.
             once: subgoals that an episode attains only once.
+            frames: of the training so far.
 
         Returns:
             Which subgoals still mean an event that they meant before, ``[G]`` bool.
@@ -85,8 +89,10 @@ class SubgoalTable(nn.Module):
         self.tokens[: len(tokens)] = torch.tensor(tokens, dtype=torch.int64)
         self.slots[: len(tokens)] = torch.tensor([slots[token] for token in tokens], dtype=torch.int64)
         self.once[list(once)] = True
-        kept = [not old.isdisjoint(self.tokens_of(subgoal)) for subgoal, old in enumerate(before)]
-        return torch.tensor(kept, device=self.once.device)
+        same = [not old.isdisjoint(self.tokens_of(subgoal)) for subgoal, old in enumerate(before)]
+        kept = torch.tensor(same, device=self.once.device)
+        self.found.copy_(torch.where(kept, self.found, frames).masked_fill(~self.in_use, 0))
+        return kept
 
     def attained(self, tokens: Tensor) -> Tensor:
         """Which subgoals steps with these tokens ``[*, K]`` attained, ``[*, G]`` bool."""

@@ -107,6 +107,11 @@ def test_frames_are_those_of_the_loaded_weights(run, tmp_path, command, monkeypa
     assert [frame.score for frame in kept] == [frame.score for frame in expected]
 
 
+def test_a_picture_is_a_sheet_of_subgoals(run, command):
+    assert command(f"run={run}", "out=sheet.png", "episodes=2") == "sheet.png: 2 episodes\n"
+    assert Image.open("sheet.png").width > 500 and not list(Path().glob(".sheet*"))
+
+
 def test_an_mp4_is_written_to_a_new_folder(run, command):
     pytest.importorskip("av")
     command(f"run={run}", "out=new/folder/episode.MP4", "episodes=1")
