@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -46,6 +47,7 @@ def scene_of(
         subgoal_names=subgoal_names(env, task),
         rendered=_rendered(env),
         observation=None if observation is None else observation.detach().cpu().numpy(),
+        parts=() if isinstance(env, BatchedEnvBase) else getattr(env, "observation_parts", ()),
     )
 
 
@@ -72,12 +74,14 @@ class PlainScene:
         subgoal_names: name of each subgoal.
         rendered: a picture ``[height, width, 3]`` uint8, a string, or nothing.
         observation: what the agent sees.
+        parts: names and sizes of the entries that a vector is joined from, if it is.
     """
 
     action_names: tuple[str, ...]
     subgoal_names: tuple[str, ...]
     rendered: NDArray[np.uint8] | str | None
     observation: NDArray | None
+    parts: tuple[tuple[str, int], ...] = ()
 
     hazard = "hazard"
 
@@ -110,13 +114,20 @@ class PlainScene:
         """The observation in numbers."""
         if self.observation is None:
             return Text("no picture")
-        return Text(
-            _cut(
-                np.array2string(
-                    self.observation, precision=2, threshold=200, max_line_width=_LONGEST_LINE, suppress_small=True
-                )
-            )
-        )
+        if not self.parts:
+            return Text(_cut(_numbers(self.observation)))
+        ends = np.cumsum([size for _, size in self.parts])[:-1]
+        values = zip(self.parts, np.split(self.observation, ends), strict=True)
+        return Text(_cut("\n".join(f"{_short(name)} {_numbers(value)}" for (name, _), value in values)))
+
+
+def _numbers(array: NDArray) -> str:
+    return np.array2string(array, precision=2, threshold=200, max_line_width=_LONGEST_LINE, suppress_small=True)
+
+
+def _short(name: str) -> str:
+    """``camera.left`` of ``observation['camera']['left']``."""
+    return ".".join(re.findall(r"\['?([^]']+)'?\]", name))
 
 
 def _rendered(env: EnvBase) -> NDArray[np.uint8] | str | None:

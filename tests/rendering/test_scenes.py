@@ -1,11 +1,14 @@
 import numpy as np
 import pytest
 import torch
+from gym_toys import Counter
+from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT, small_env
 from torchrl.envs import GymEnv
 from user_envs import Corridor, Pictured
 
-from hdrqn_torchrl.envs import MultiGoalGridEnv
+from hdrqn_torchrl.envs import MultiGoalGridEnv, make_gym
 from hdrqn_torchrl.envs.grid.cells import palette
 from hdrqn_torchrl.rendering import scene_of
 
@@ -145,3 +148,25 @@ def test_the_world_of_an_environment_is_what_it_renders():
     picture = pixels(scene.draw_world(100))
     assert picture.shape == (40, 100, 3) and (picture[0, 45] == [255, 0, 0]).all() and (picture[0, 5] == 255).all()
     assert scene.subgoal_names == ("west", "east") and scene.action_names == ("go west", "go east")
+
+
+@pytest.mark.parametrize(
+    ("clock", "shown"), [(spaces.Discrete(3), "clock [0. 1. 0.]"), (spaces.Box(-9, 9, (2,)), "clock [1. 1.]")]
+)
+def test_entries_of_a_dict_are_shown_by_their_names(clock, shown):
+    time = 1 if isinstance(clock, spaces.Discrete) else np.ones(2, np.float32)
+    space = spaces.Dict({"clock": clock, "count": Counter.observation_space})
+    env = make_gym(
+        lambda: TransformObservation(Counter(), lambda count: {"clock": time, "count": count}, space), 1, seed=0
+    )
+    observation = env.reset()["observation"][0]
+    first, second = scene_of(env, observation=observation).write_view().plain.splitlines()
+    assert first == shown and second == f"count [{observation[-2]:.0f}. 0.]"
+
+
+def test_codes_of_a_dict_are_shown_by_the_names_of_its_entries():
+    space = spaces.Dict({"room": spaces.Discrete(9), "keys": spaces.MultiBinary(2)})
+    told = {"room": 7, "keys": np.array([0, 1])}
+    env = make_gym(lambda: TransformObservation(Counter(), lambda _: told, space), 1, seed=0)
+    text = scene_of(env, observation=env.reset()["observation"][0]).write_view().plain
+    assert set(text.splitlines()) == {"room [7]", "keys [0 1]"}

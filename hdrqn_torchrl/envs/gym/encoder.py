@@ -23,7 +23,7 @@ class Encoder:
     Attributes:
         encode: takes an observation of the environment.
         space: of what it returns: a ``Box`` (image or vector) or ``MultiDiscrete`` (codes).
-        parts: names and sizes of the entries that a vector of floats is joined from; empty: it is one.
+        parts: names and sizes of the entries that a vector is joined from; empty: it is one.
     """
 
     encode: Callable[[Any], NDArray]

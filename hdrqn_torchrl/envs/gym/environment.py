@@ -138,6 +138,11 @@ class GymTaskEnv(EnvBase):
         """
         return self.worlds.vector.envs[0].unwrapped  # type: ignore[attr-defined]
 
+    @property
+    def observation_parts(self) -> tuple[tuple[str, int], ...]:
+        """Names and sizes of the entries that a vector is joined from; empty if it is not."""
+        return self._reading.encoder.parts
+
     def render(self) -> Any:
         """A picture of the first world ``[height, width, 3]``, if it makes one."""
         return None if self._render is None else self._render()

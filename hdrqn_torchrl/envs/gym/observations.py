@@ -6,7 +6,9 @@ vector of codes ``[D]`` with a number of codes for each entry.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -192,14 +194,18 @@ def _joined(encoders: dict[Any, Encoder], where: str) -> Encoder:
         )
     if all(isinstance(each.space, spaces.MultiDiscrete) for _, each in parts):
         numbers = np.concatenate([np.asarray(each.space.nvec).reshape(-1) for _, each in parts])  # type: ignore[union-attr]
-        return as_codes(numbers, partial(_concatenated, parts, where), where)
+        return replace(as_codes(numbers, partial(_concatenated, parts, where), where), parts=_sizes(parts, where))
     floats = [(name, _as_floats(each)) for name, each in parts]
     low, high = (np.concatenate([getattr(each.space, end) for _, each in floats]) for end in ("low", "high"))
     return Encoder(
         encode=partial(_concatenated, floats, where),
         space=spaces.Box(low, high, dtype=np.float32),
-        parts=tuple((f"{where}[{name!r}]", each.space.shape[0]) for name, each in floats),
+        parts=_sizes(floats, where),
     )
+
+
+def _sizes(parts: Sequence[tuple[Any, Encoder]], where: str) -> tuple[tuple[str, int], ...]:
+    return tuple((f"{where}[{name!r}]", math.prod(each.space.shape)) for name, each in parts)
 
 
 def _concatenated(parts: Sequence[tuple[Any, Encoder]], where: str, value: Any) -> NDArray:
