@@ -1,15 +1,15 @@
 """A model of collection by workers, frames per second against their number: ``python benchmarks/scaling.py``.
 
-Discrete events: each worker acts for a round, its batch travels, the learner takes in the batches of all workers,
-stores them, and makes the updates that are owed; then (``sync``), or as soon as the last batch has arrived, the next
-round is ordered. The times are those of one machine (below, with what measures them); a cluster's network is assumed.
-Workers that share cores, with each other or with a learner that learns, slow down. Prints one JSON object.
+Discrete events: each worker acts for a round, its batch travels, the first process takes the batches of all workers in
+their order, stores them, and makes the updates that are owed. Each worker gets its next order as soon as its batch has
+been taken, or (``sync``) all of them after the updates. Workers that share cores slow down, and no more is done than
+all cores can. The times are those of one machine (``benchmarks/workers.py``, which also checks this model); a
+cluster's network is assumed. Prints one JSON object.
 """
 
 from __future__ import annotations
 
 import argparse
-import heapq
 import json
 import random
 from dataclasses import dataclass, replace
@@ -20,30 +20,34 @@ class Times:
     """What a training costs, in seconds.
 
     Args:
-        act: to act and to step one world once, on a core of its own (``benchmarks/gymnasium_worlds.py``, "acting").
+        act: of a worker, to act and to step one world once (``benchmarks/workers.py``: ``worker_us``).
         jitter: standard deviation of a worker's round, as a share of it.
         order: to send one worker its weights and its order.
-        receive: to take in a batch, for each frame in it.
+        receive: to take a batch, for each frame in it.
         latency: until a message has arrived.
-        store: to store one frame.
+        store: to unpack one frame and to store it.
         update: of one update (``benchmarks/updates_v3.py``).
         frames_per_update: collected for each.
     """
 
     act: float
     jitter: float = 0.05
-    order: float = 0.002
-    receive: float = 5e-6
+    order: float = 0.0005
+    receive: float = 2e-6
     latency: float = 0.0005
     store: float = 2e-5
     update: float = 0.0
     frames_per_update: int = 32
 
+    def first(self) -> float:
+        """Of the first process, for each frame that it has."""
+        return self.store + self.update / self.frames_per_update
+
 
 def frames_per_second(
     times: Times, *, workers: int, cores: int, worlds: int, steps: int, sync: bool, rounds: int = 200, seed: int = 0
 ) -> float:
-    """Of so many workers, one core being the learner's.
+    """Of so many workers.
 
     Args:
         times: what everything costs.
@@ -55,27 +59,28 @@ def frames_per_second(
         rounds: that are simulated.
         seed: of the jitter.
     """
-    draw = random.Random(seed)
-    frames = workers * worlds * steps
-    crowding = max(1.0, (workers + (times.update > 0)) / cores)
-    learner = 0.0  # when it is free
-    updates = frames * (times.store + times.update / times.frames_per_update)
-    arrivals: list[float] = []
+    draw, own = random.Random(seed), worlds * steps
+    crowding = max(1.0, workers / cores)
+    now, arrivals = 0.0, [0.0] * workers  # in the first process; of the workers' next batches
 
-    def order(now: float) -> float:
-        """Sends all workers their orders; returns when the last is sent."""
-        for _ in range(workers):
-            now += times.order
-            length = worlds * steps * times.act * crowding * max(0.2, draw.gauss(1.0, times.jitter))
-            heapq.heappush(arrivals, now + 2 * times.latency + length)
-        return now
+    def order(index: int, now: float) -> float:
+        """Sends a worker its order; returns when that is done."""
+        length = own * times.act * crowding * max(0.2, draw.gauss(1.0, times.jitter))
+        arrivals[index] = now + times.order + 2 * times.latency + length
+        return now + times.order
 
-    learner = order(learner)
+    for index in range(workers):
+        now = order(index, now)
     for _ in range(rounds):
-        for _ in range(workers):
-            learner = max(learner, heapq.heappop(arrivals)) + worlds * steps * times.receive
-        learner = order(learner + updates) if sync else order(learner) + updates
-    return rounds * frames / learner
+        for index in range(workers):
+            now = max(now, arrivals[index]) + own * times.receive
+            if not sync:
+                now = order(index, now)
+        now += workers * own * times.first()
+        for index in range(workers if sync else 0):
+            now = order(index, now)
+    cost = times.act + times.first() + times.receive + times.order / own
+    return min(rounds * workers * own / now, cores / cost)
 
 
 def main() -> None:

@@ -13,6 +13,8 @@ class HereWorkers:
     def __init__(self, make):
         self.make, self.started, self.closed = make, [], 0
         self.loses = []  # numbers of those that are lost at their next answer
+        self.refuses = []  # numbers of those that are lost when they are next sent something
+        self.calls = []  # what was sent and received, and whose it is
         self.has_gone = False
 
     def start(self, index, *, seed):
@@ -20,7 +22,7 @@ class HereWorkers:
         return HereWorker(self, index, seed)
 
     def share(self, weights):
-        return {name: value.clone() for name, value in weights.items()}
+        return weights
 
     def close(self):
         self.closed += 1
@@ -34,6 +36,10 @@ class HereWorker:
             self.stream = torch.get_rng_state()
 
     def send(self, method, *args):
+        if self.index in self.place.refuses:
+            self.place.refuses.remove(self.index)
+            raise WorkerLost("was lost")
+        self.place.calls.append(("send", self.index))
         self.call = method, args
 
     def receive(self, seconds):
@@ -42,6 +48,7 @@ class HereWorker:
         if self.index in self.place.loses:
             self.place.loses.remove(self.index)
             raise WorkerLost("was lost")
+        self.place.calls.append(("receive", self.index))
         method, args = self.call
         if method == "collect" and len(args) > 1 and args[1] is not None:
             return self.worker.collect(*args)

@@ -15,6 +15,8 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.runs.workers.handles import PlaceLost, WorkerHandle, WorkerLost, WorkerPlace
+from hdrqn_torchrl.runs.workers.packing import pack, unpack
+from hdrqn_torchrl.runs.workers.worker import Delivery
 
 _MOST_FAILURES = 3
 
@@ -75,6 +77,7 @@ class WorkersCollector:
         self._next_ids = [0] * workers
         self._failures = [0] * workers  # since its last answer
         self._workers: list[WorkerHandle] = []
+        self._round = 0  # frames of all workers' batches together; 0: not known yet
         self._ordered = self._is_new = self._has_given_up = False
         self._version = 0  # updates of the weights that were sent last
         self._ready: TensorDictBase | None = None
@@ -85,7 +88,7 @@ class WorkersCollector:
         while self.frames < self.total_frames:
             batch = self._collected()
             self.frames += batch.numel()
-            if not self.sync and self.frames < self.total_frames:
+            if not self.sync and not self._ordered and self.frames < self.total_frames:
                 self._order()
             yield batch
 
@@ -100,7 +103,7 @@ class WorkersCollector:
             return batch
         if not self._ordered:
             self._order()
-        return self._gather()
+        return self._gather(and_order=not self.sync and 0 < self._round < self.total_frames - self.frames)
 
     def _start(self) -> None:
         if not self._workers:
@@ -116,34 +119,50 @@ class WorkersCollector:
     def _order(self) -> None:
         """Asks all workers for a batch."""
         self._start()
-        weights = self.place.share(self._weights()) if self._is_new else None
-        stream = self._stream()
+        order = self._next_order()
         for index in range(len(self._workers)):
-            self._send(index, "collect", weights, stream)
-        self._ordered, self._is_new, self._version = True, False, self.updates()
+            self._send(index, "collect", *order)
+        self._ordered = True
 
-    def _weights(self) -> dict[str, Tensor]:
-        return {name: value.detach().cpu() for name, value in self.policy.state_dict().items()}
+    def _next_order(self) -> tuple[Any, Tensor | None]:
+        """What all workers are sent: weights, if they are new, and random numbers."""
+        weights = self._shared_weights() if self._is_new else None
+        self._is_new, self._version = False, self.updates()
+        return weights, self._stream()
+
+    def _shared_weights(self) -> Any:
+        return self.place.share(pack({name: value.detach().cpu() for name, value in self.policy.state_dict().items()}))
 
     def _stream(self) -> Tensor | None:
         """One worker that is waited for draws from the learner's random numbers: it is then no other than none."""
         return torch.get_rng_state() if self.sync and len(self._starts) == 1 else None
 
-    def _gather(self) -> TensorDictBase:
-        """One batch of all workers."""
-        deliveries = [self._receive(index, "collect", None, self._stream()) for index in range(len(self._workers))]
-        self._ordered = False
+    def _gather(self, *, and_order: bool = False) -> TensorDictBase:
+        """One batch of all workers.
+
+        Args:
+            and_order: each is asked for the next one as soon as it has delivered, before anything is unpacked.
+        """
         self._ages.append(self.updates() - self._version)
-        if deliveries[0].stream is not None:
-            torch.set_rng_state(deliveries[0].stream)
-        batches = [self._numbered(index, each.batch) for index, each in enumerate(deliveries)]
+        order = self._next_order() if and_order else None
+        received: list[tuple[Delivery, int]] = []
+        for index in range(len(self._workers)):
+            delivery: Delivery = self._receive(index, "collect", None, self._stream())
+            first = self._first_ids[index]
+            self._next_ids[index] = max(self._next_ids[index], first + delivery.last_id + self.worlds)
+            received.append((delivery, first))
+            if order is not None:
+                self._send(index, "collect", *order)
+        self._ordered = and_order
+        if (stream := received[0][0].stream) is not None:
+            torch.set_rng_state(stream)
+        batches = [self._numbered(index, unpack(each.batch), first) for index, (each, first) in enumerate(received)]
+        self._round = sum(batch.numel() for batch in batches)
         return batches[0] if len(batches) == 1 else torch.cat(batches, 0)  # type: ignore[return-value]
 
-    def _numbered(self, index: int, batch: TensorDictBase) -> TensorDictBase:
+    def _numbered(self, index: int, batch: TensorDictBase, first: int) -> TensorDictBase:
         """The batch with numbers of episodes that no other worker has, nor this one before it was replaced."""
-        ids = batch.get(keys.TRAJ_IDS) + self._first_ids[index]
-        self._next_ids[index] = max(self._next_ids[index], int(ids.max()) + self.worlds)
-        return batch.set(keys.TRAJ_IDS, ids * len(self._workers) + index)
+        return batch.set(keys.TRAJ_IDS, (batch.get(keys.TRAJ_IDS) + first) * len(self._workers) + index)
 
     def _send(self, index: int, method: str, *args: Any) -> None:
         while True:
@@ -171,7 +190,7 @@ class WorkersCollector:
 
     def _afresh(self, method: str, args: tuple[Any, ...]) -> tuple[Any, ...]:
         """Arguments of a call for a worker that has no weights yet."""
-        return (self.place.share(self._weights()), *args[1:]) if method == "collect" else args
+        return (self._shared_weights(), *args[1:]) if method == "collect" else args
 
     def _replace(self, index: int, reason: WorkerLost) -> None:
         """Another worker with new episodes in the same rows."""
@@ -249,10 +268,9 @@ class WorkersCollector:
             self._start()
             self._ask_all("load_state_dict", [(each,) for each in stored])
         self.frames, self._ready, self._ordered, self._is_new = state["frames"], state["ready"], False, True
-        self._starts, self._first_ids = list(state["starts"]), list(state["first_ids"])
-        self._next_ids = list(state["next_ids"])
+        self._starts, self._ages = list(state["starts"]), list(state["ages"])
+        self._first_ids, self._next_ids = list(state["first_ids"]), list(state["next_ids"])
         self.lost_workers, self.lost_episodes = state["lost_workers"], state["lost_episodes"]
-        self._ages = list(state["ages"])
 
     def _ask_all(self, method: str, arguments: Sequence[tuple[Any, ...]] = ()) -> list[Any]:
         """Their answers to a call with arguments for each of them."""

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Protocol
-
-from torch import Tensor
 
 
 class WorkerLost(RuntimeError):
@@ -48,8 +45,8 @@ class WorkerPlace(Protocol):
     def start(self, index: int, *, seed: int) -> WorkerHandle:
         """Starts a worker, without waiting until it is ready."""
 
-    def share(self, weights: Mapping[str, Tensor]) -> Any:
-        """What is sent to all workers in place of ``weights``."""
+    def share(self, weights: bytes) -> Any:
+        """What is sent to all workers in place of the packed ``weights``."""
 
     def close(self) -> None:
         """Leaves nothing behind."""

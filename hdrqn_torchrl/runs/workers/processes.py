@@ -7,12 +7,9 @@ import os
 import pickle
 import signal
 import traceback
-from collections.abc import Mapping
 from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
-
-from torch import Tensor
 
 from hdrqn_torchrl.runs.workers.handles import WorkerError, WorkerLost
 from hdrqn_torchrl.runs.workers.worker import Worker
@@ -32,7 +29,7 @@ class ProcessWorkers:
         """See :class:`WorkerPlace`."""
         return ProcessWorker(partial(self.make, index, seed=seed))
 
-    def share(self, weights: Mapping[str, Tensor]) -> Mapping[str, Tensor]:
+    def share(self, weights: bytes) -> bytes:
         """The weights; a pipe copies them."""
         return weights
 

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
 from functools import partial
 from typing import Any
-
-from torch import Tensor
 
 from hdrqn_torchrl.runs.workers.handles import WorkerError, WorkerLost
 from hdrqn_torchrl.runs.workers.ray_cluster import RayCluster, load_ray
@@ -29,7 +26,7 @@ class RayWorkers:
     def __init__(self, make: partial[Worker], *, workers: int, address: str | None = None) -> None:
         self.cluster = RayCluster(cores=workers, address=address, setting="collector.address")
         _warn_of_few_cores(workers)
-        self._actor = load_ray().remote(num_cpus=1, max_restarts=0)(Worker)
+        self._actor = load_ray().remote(num_cpus=1, max_restarts=0)(make.func)
         self.make = make
 
     def start(self, index: int, *, seed: int) -> RayWorker:
@@ -37,10 +34,10 @@ class RayWorkers:
         self.cluster.check()
         return RayWorker(self._actor.remote(*self.make.args, index, seed=seed, **self.make.keywords), self.cluster)
 
-    def share(self, weights: Mapping[str, Tensor]) -> Any:
+    def share(self, weights: bytes) -> Any:
         """A reference to the weights in Ray's object store, where each machine gets them once."""
         self.cluster.check()
-        return load_ray().put(dict(weights))
+        return load_ray().put(weights)
 
     def close(self) -> None:
         """Ends the cluster, or the connection to it, if it began here."""

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import EpsilonGreedy
 from hdrqn_torchrl.runs.checkpoint import RandomState
 from hdrqn_torchrl.runs.collectors import ResumableCollector
+from hdrqn_torchrl.runs.workers.packing import pack, unpack
 
 
 class MakeWorker(Protocol):
@@ -28,8 +28,10 @@ class MakeWorker(Protocol):
 class Delivery(NamedTuple):
     """What a worker sends for each order."""
 
-    batch: TensorDictBase
-    """``[n, T]``"""
+    batch: bytes
+    """``[n, T]``, packed"""
+    last_id: int
+    """The highest number of an episode in it."""
     stream: Tensor | None
     """The random numbers that follow, if the order came with some."""
 
@@ -53,7 +55,7 @@ class Worker:
         ...     env = MultiGoalGridEnv(num_envs=2, seed=seed)
         ...     agent = make_drqn(env, compact_network())
         ...     return agent.transform(env), agent.policy
-        >>> Worker(make, 0, seed=0, steps=3).collect(None).batch.shape
+        >>> unpack(Worker(make, 0, seed=0, steps=3).collect(None).batch).shape
         torch.Size([2, 3])
     """
 
@@ -86,19 +88,20 @@ class Worker:
         )
         self._batches = iter(self.collector)
 
-    def collect(self, weights: Mapping[str, Tensor] | None, stream: Tensor | None = None) -> Delivery:
+    def collect(self, weights: bytes | None, stream: Tensor | None = None) -> Delivery:
         """The next batch.
 
         Args:
-            weights: state of the policy; ``None``: as before.
+            weights: packed state of the policy; ``None``: as before.
             stream: state of torch's random generator, which goes on where someone else's stands; ``None``: its own.
         """
         if weights is not None:
-            self.policy.load_state_dict(weights)
+            self.policy.load_state_dict(unpack(weights))
         if stream is not None:
             torch.set_rng_state(stream)
         batch = next(self._batches)
-        return Delivery(batch, None if stream is None else torch.get_rng_state())
+        last_id = int(batch.get(keys.TRAJ_IDS).max())
+        return Delivery(pack(batch), last_id, None if stream is None else torch.get_rng_state())
 
     def state_dict(self) -> dict[str, Any]:
         """Its worlds, options and recurrent states, and its random numbers."""

@@ -67,13 +67,27 @@ def test_nothing_of_one_world_ends_in_another_when_workers_are_lost(agent, sync)
         assert check_options(algorithm, batches) >= 1_000
 
 
-def test_episodes_have_numbers_of_their_own():
-    _, collector = stamped("v3", 2)
-    collector.place.loses.append(1)
-    whole = torch.cat(rounds(collector, 6), 1)
+@pytest.mark.parametrize("lost", ["loses", "refuses"])
+@pytest.mark.parametrize("sync", [True, False])
+def test_episodes_have_numbers_of_their_own(sync, lost):
+    _, collector = stamped("v3", 2, sync=sync)
+    batches = iter(collector)
+    seen = [next(batches).clone() for _ in range(2)]
+    getattr(collector.place, lost).append(1)
+    whole = torch.cat([*seen, *(next(batches).clone() for _ in range(5))], 1)
+    assert collector.lost_workers == 1
     stamps = whole["observation"][..., :3].flatten(0, 1).tolist()
     numbers = whole["collector", "traj_ids"].flatten().tolist()
     assert len(set(map(tuple, stamps))) == len(set(numbers)) == len(set(zip(map(tuple, stamps), numbers, strict=True)))
+
+
+def test_a_worker_that_is_not_to_wait_is_asked_again_as_soon_as_it_has_delivered():
+    _, collector = stamped("v3", 2, sync=False)
+    batches = iter(collector)
+    next(batches)
+    collector.place.calls.clear()
+    next(batches)
+    assert collector.place.calls == [("receive", 0), ("send", 0), ("receive", 1), ("send", 1)]
 
 
 def test_a_worker_that_is_replaced_plays_other_episodes():
