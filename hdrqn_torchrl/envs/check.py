@@ -132,7 +132,9 @@ def _statement(env: EnvBase, task: Task) -> Iterator[Finding]:
     if task.max_steps is None:
         yield missing("the length of episodes is unknown", "evaluations need max_steps, v3 needs slice_len")
     if task.largest_return == float("inf") or task.largest_extrinsic_return == float("inf"):
-        yield missing("the largest returns are unknown", "targets are not bounded")
+        yield missing(
+            "the largest returns are unknown", "targets are not bounded, and a resume does not notice other rewards"
+        )
     if not task.subgoals and keys.ATTAINED in env.observation_spec.keys():  # noqa: SIM118 (a spec)
         yield missing("the subgoals are not stated", "they have no names, and there is no third level")
     if not task.actions:

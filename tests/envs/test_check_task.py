@@ -210,7 +210,7 @@ def test_values_that_are_no_numbers_or_no_codes_are_the_only_fault_that_is_told(
         (Corridor(4, task=WHOLE), "no penalty for hazards"),
         (Corridor(4, without=("attained", "hazard", "success")), "agents of one level only"),
         (Corridor(4, task=WHOLE, without=("extrinsic_reward",)), "agents of one level only"),
-        (Corridor(4), "targets are not bounded"),
+        (Corridor(4), "targets are not bounded, and a resume does not notice other rewards"),
         (Corridor(4), "evaluations need max_steps, v3 needs slice_len"),
         (Corridor(4), "they have no names, and there is no third level"),
         (Corridor(4), "watch.py numbers them"),
