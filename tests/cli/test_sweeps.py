@@ -14,9 +14,10 @@ from hydra import compose, initialize_config_dir
 from hydra.core.utils import JobReturn, JobStatus
 from omegaconf import OmegaConf
 from processes import run_script
-from programs import CONF, ROOT, TINY, TINY_HDRQN, call, wait_until
+from programs import ROOT, TINY, TINY_HDRQN, call, wait_until
 
 from hdrqn_torchrl.cli import sweeps
+from hdrqn_torchrl.cli.configuration import CONF
 from hdrqn_torchrl.runs.interruption import Interrupted
 
 WRONG = "algo.gamma must lie in [0, 1], got 7"
