@@ -35,7 +35,7 @@ class Times:
     order: float = 0.0005
     receive: float = 2e-6
     latency: float = 0.0005
-    store: float = 2e-5
+    store: float = 3e-5
     update: float = 0.0
     frames_per_update: int = 32
 
@@ -86,7 +86,7 @@ def frames_per_second(
 def main() -> None:
     """Predicts, prints."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--act", type=float, default=1 / 1_900, help="seconds")
+    parser.add_argument("--act", type=float, default=1 / 4_764, help="seconds; of one process alone")
     parser.add_argument("--update", type=float, default=0.04, help="seconds; 0: nobody learns")
     parser.add_argument("--worlds", type=int, default=16, help="of each worker")
     parser.add_argument("--steps", type=int, default=8)

@@ -81,6 +81,13 @@ class TestJob:
         sweep.save()
         assert sweep.run() == "auto"
 
+    def test_with_several_seeds_it_goes_on_if_any_of_them_was_saved(self, tmp_path, name):
+        sweep = Begun(tmp_path, name)
+        sweep.note(0)
+        sweep.save()  # seed 3
+        job = launchers.Job(sweep.launcher, 0, ["algo=hdqn", "seeds=2..3"])
+        assert job().return_value == "auto"
+
     def test_the_run_of_an_earlier_sweep_is_left_alone(self, tmp_path, name):
         sweep = Begun(tmp_path, name)
         sweep.save()
@@ -182,6 +189,26 @@ def test_a_preempted_job_of_submitit_saves_itself_and_nothing_is_done_twice(tmp_
     evaluated = [line.split()[1] for line in output.read_text().splitlines() if " frames/s" in line]
     assert len(evaluated) == len(set(evaluated)) == sum(bool(row["greedy/return"]) for row in undisturbed)
     assert not list((tmp_path / "sweep").rglob("*.pkl"))
+
+
+@needs_submitit
+@pytest.mark.slow
+def test_a_preempted_job_with_several_seeds_goes_on_with_each_where_it_was(tmp_path, undisturbed):
+    def of(seed):
+        return csv.DictReader((tmp_path / f"sweep/0-gridworld-hdqn-seed{seed}/metrics.csv").read_text().splitlines())
+
+    process = start(tmp_path, "sweep=slurm", "hydra.launcher.cluster=local", "seeds=0..2")
+    wait_until(lambda: len(list(tmp_path.glob("sweep/0-*/metrics.csv"))) == 3 and len(list(of(2))) >= 3)
+    os.kill(first := process_of(tmp_path), signal.SIGUSR2)
+    _, told = process.communicate(timeout=400)
+    assert process.returncode == 0, told
+    assert process_of(tmp_path) != first
+    assert without_times(of(0)) == undisturbed
+    for seed in (1, 2):
+        frames = [row["frames"] for row in of(seed)]
+        assert frames == [row["frames"] for row in undisturbed]
+        assert json.loads((tmp_path / f"sweep/0-gridworld-hdqn-seed{seed}/summary.json").read_text())["frames"] >= 6000
+    assert [note["state"] for note in sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl")] == ["done"]
 
 
 @needs_ray

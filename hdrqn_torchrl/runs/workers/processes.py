@@ -9,6 +9,7 @@ import signal
 import traceback
 from functools import partial
 from multiprocessing.connection import Connection
+from multiprocessing.util import Finalize
 from typing import Any
 
 from hdrqn_torchrl.runs.workers.handles import WorkerError, WorkerLost
@@ -46,6 +47,7 @@ class ProcessWorker:
         self.process = context.Process(target=_serve, args=(theirs, make), daemon=True)
         self.process.start()
         theirs.close()
+        self._kill = Finalize(None, self.process.kill, exitpriority=10)  # else Python waits for it when it ends
 
     def send(self, method: str, *args: Any) -> None:
         """See :class:`WorkerHandle`."""
@@ -69,7 +71,7 @@ class ProcessWorker:
     def stop(self) -> None:
         """See :class:`WorkerHandle`."""
         self._pipe.close()
-        self.process.kill()
+        self._kill()
         self.process.join()
         self.process.close()
 
@@ -90,7 +92,8 @@ def _get(pipe: Connection) -> Any:
 
 def _serve(pipe: Connection, make: partial[Worker]) -> None:
     """Answers until the other side is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal: the learner decides when a worker ends
+    for number in (signal.SIGINT, signal.SIGTERM):  # of the terminal, of Slurm: they reach all processes of a job, and
+        signal.signal(number, signal.SIG_IGN)  # the first saves what the workers have begun
     os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
     worker: Worker | None = None
     while True:

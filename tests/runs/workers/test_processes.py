@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import time
 from functools import partial
 
@@ -55,6 +56,10 @@ def test_a_killed_worker_is_replaced_and_none_is_left_behind(capsys):
     seeds = whole["observation"][2:, :, 0]
     assert len(seeds.unique()) == 2 and len(seeds.unique_consecutive(dim=1)[0]) == 2
     pids = [worker.process.pid for worker in collector._workers]
+    for pid in pids:
+        os.kill(pid, signal.SIGTERM)  # as Slurm does, to all processes of a job
+    next(batches)
+    assert collector.metrics()["collector/lost_workers"] == 1
     collector.shutdown()
     for pid in pids:
         with pytest.raises(OSError):
