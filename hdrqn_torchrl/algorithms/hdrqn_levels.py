@@ -142,6 +142,7 @@ class LevelBuilder:
                 num_envs=has.num_envs,
                 episode_len=has.task.max_steps,
                 refresh=self._relabel(pursued) if hindsight else None,
+                refresh_reads=False,
             )
 
     def upper_learner(

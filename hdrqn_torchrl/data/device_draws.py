@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from hdrqn_torchrl.data.device_priorities import DevicePrioritySampler, cumulative, pick
 from hdrqn_torchrl.data.replay import SequenceBuffer
 from hdrqn_torchrl.data.slices import padded_slices
 
@@ -17,7 +18,8 @@ class DeviceDraws:
     find out. Here every stored step has a weight, in a table as long as the memory.
 
     Args:
-        buffer: drawn from uniformly, of :func:`~hdrqn_torchrl.data.make_sequence_buffer`.
+        buffer: of :func:`~hdrqn_torchrl.data.make_sequence_buffer`, on the device; if it draws by priority, so does
+            every call of :meth:`draw`, by those of that moment.
         sequences: of a draw.
         length: steps of a sequence, lookahead included.
 
@@ -29,36 +31,52 @@ class DeviceDraws:
         self._storage, self._sampler = buffer._storage, buffer._sampler
         self._sequences, self._length = sequences, length
         self._revision: int | None = None
-        self._cumulative: Tensor | None = None  # [capacity], of weights
+        self._sums: Tensor | None = None  # [capacity], of weights
         self._left: Tensor | None = None  # [capacity]
         self._pads = False
 
     def refresh(self) -> None:
         """Takes up what was written since the last call; no part of a capture."""
-        if self._revision == self._storage._mutation_revision:
-            return
-        self._revision = self._storage._mutation_revision
+        if isinstance(self._sampler, DevicePrioritySampler):
+            self._sampler.admit(self._storage)
+        elif self._revision != self._storage._mutation_revision:
+            self._revision = self._storage._mutation_revision
+            self._tabulate()
+
+    def _tabulate(self) -> None:
         weight, left = self._sampler.weights(self._storage)
-        if self._cumulative is None:
-            self._cumulative = weight.new_zeros(self._storage.max_size)
-            self._left = torch.full_like(self._cumulative, self._length, dtype=torch.int64)
+        if self._sums is None:
+            self._sums = torch.zeros(self._storage.max_size, dtype=torch.int64, device=weight.device)
+            self._left = torch.full_like(self._sums, self._length)
         written = weight.numel()
-        self._cumulative[:written] = weight.flatten().cumsum(0)
-        self._cumulative[written:] = self._cumulative[written - 1]
+        self._sums[:written] = cumulative(weight.flatten())
+        self._sums[written:] = self._sums[written - 1]
         self._pads = left is not None
         if left is not None and self._left is not None:
             self._left[:written] = left.flatten()
 
     def draw(self) -> TensorDictBase:
         """Sequences ``[B, T]``, with what ``buffer.sample`` writes into them."""
-        assert self._cumulative is not None and self._left is not None, "refresh() comes before the first draw"
-        total = self._cumulative[-1]
-        ticket = torch.rand(self._sequences, dtype=total.dtype, device=total.device) * total
-        place = torch.searchsorted(self._cumulative, ticket.clamp(max=total * (1 - 1e-15)), right=True)
+        place, left, info = self._choose()
         others = self._storage.row_shape[0] if self._storage.row_shape else 1
         start = torch.stack([place // others, place % others][: self._storage.ndim], -1)
-        index, info = padded_slices(start, self._left[place], self._length, rows=self._storage.rows)
+        index, mask = padded_slices(start, left, self._length, rows=self._storage.rows)
         drawn = self._storage._storage[index]  # also of rows that were not written yet, when it was captured
-        for key, value in {**(info if self._pads else {}), "index": torch.stack(index, -1)}.items():
+        info["index"] = torch.stack(index, -1)
+        for key, value in ({**mask, **info} if self._pads else info).items():
             drawn.set(key, value)
         return drawn.reshape(-1, self._length)
+
+    def _choose(self) -> tuple[Tensor, Tensor, dict[NestedKey, Tensor]]:
+        """Places of starts and steps left from there, ``[B]``, and what else a sampler tells, ``[B * T]``."""
+        if isinstance(self._sampler, DevicePrioritySampler):
+            self._pads = True
+            place, weight = self._sampler.draw(self._sequences)
+            return place, self._sampler.left[place], {"priority_weight": weight.repeat_interleave(self._length)}
+        assert self._sums is not None and self._left is not None, "refresh() comes before the first draw"
+        place = pick(self._sums, self._sequences)
+        return place, self._left[place], {}
+
+    def set_priorities(self, sample: TensorDictBase, priority: Tensor) -> None:
+        """Sets the priorities ``[B]`` of sequences that were drawn."""
+        self._sampler.update_priority(sample.get("index")[:, 0], priority, storage=self._storage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -12,6 +13,64 @@ from torchrl.data.replay_buffers import PrioritizedSampler
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data.slices import episode_starts, padded_slices, steps_left
+
+PriorityStarts = Literal["steps", "episode_starts", "whole_episodes"]
+FLOOR = 1e-3
+"""Added to priorities: keeps sequences without error in play."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartRule:
+    """Which stored steps begin a sequence that is complete: long enough, or ended by its episode.
+
+    Args:
+        slice_len, sampling, init_key, traj_key, done_key, terminated_key: as in :class:`PrioritizedSequenceSampler`.
+    """
+
+    slice_len: int
+    sampling: PriorityStarts
+    init_key: NestedKey
+    traj_key: NestedKey
+    done_key: NestedKey
+    terminated_key: NestedKey | None
+
+    def find(self, storage: Storage) -> tuple[Tensor, Tensor]:
+        """Whether each stored step begins a complete sequence, and how many of its steps are real, ``[rows, N]``."""
+        stored, newest, length = storage[:], storage._last_cursor_index, self.slice_len  # type: ignore[attr-defined]
+        rows = (len(stored), -1)
+        episode, done = stored.get(self.traj_key).view(rows), stored.get(self.done_key).view(rows)
+        left, ended = steps_left(episode, done, newest)
+        complete = ended | (left >= length)
+        if self.terminated_key is not None:
+            complete &= (left > 1) | stored.get(self.terminated_key).view(rows)
+        if self.sampling == "steps":
+            return complete, left
+        init = stored.get(self.init_key).view(rows)
+        if self.sampling == "whole_episodes":
+            return init & complete, left
+        return episode_starts(init, episode, done, newest, length), torch.full_like(left, length)
+
+
+def places_of(index: Tensor, storage: Storage) -> Tensor:
+    """Places of steps ``[M, ndim]`` in a table of all, time by time."""
+    return index[:, 0] if storage.ndim == 1 else index[:, 0] * storage.shape[1] + index[:, 1]
+
+
+def check_priorities(priorities: Tensor, starts: Tensor, largest: float | None, *, capacity: int) -> None:
+    """Refuses stored priorities that are none, or of another memory.
+
+    Raises:
+        ValueError: if so.
+    """
+    shape = (capacity,)
+    if priorities.shape != shape or starts.shape != shape or starts.dtype != torch.bool:
+        raise ValueError(
+            f"stored priorities must be those of {capacity} steps, got {list(priorities.shape)} and "
+            f"{list(starts.shape)}; load them with the capacity and num_envs that they were saved with."
+        )
+    known = priorities[starts]
+    if not (torch.isfinite(known) & (known > 0)).all() or not (largest is None or 0 <= largest < float("inf")):
+        raise ValueError("stored priorities must be finite and > 0, got others; use another checkpoint.")
 
 
 class PrioritizedSequenceSampler(PrioritizedSampler):
@@ -59,7 +118,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         capacity: int,
         *,
         slice_len: int,
-        sampling: Literal["steps", "episode_starts", "whole_episodes"] = "steps",
+        sampling: PriorityStarts = "steps",
         priority_exponent: float = 0.9,
         importance_exponent: float = 0.6,
         init_key: NestedKey = keys.IS_INIT,
@@ -67,11 +126,16 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         done_key: NestedKey = ("next", keys.DONE),
         terminated_key: NestedKey | None = None,
     ) -> None:
-        # The floor eps keeps sequences without error in play.
-        super().__init__(capacity, priority_exponent, importance_exponent, eps=1e-3, device="cpu")
+        super().__init__(capacity, priority_exponent, importance_exponent, eps=FLOOR, device="cpu")
         self.slice_len, self.sampling = slice_len, sampling
-        self.init_key, self.traj_key, self.done_key = init_key, traj_key, done_key
-        self.terminated_key = terminated_key
+        self._rule = StartRule(
+            slice_len=slice_len,
+            sampling=sampling,
+            init_key=init_key,
+            traj_key=traj_key,
+            done_key=done_key,
+            terminated_key=terminated_key,
+        )
         self._forget()
 
     def _forget(self) -> None:
@@ -90,7 +154,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         self._rng = self._rng or torch.default_generator  # TorchRL's own choice is NumPy's
         drawn, _ = super().sample(storage, batch_size // self.slice_len)
         start = torch.stack(drawn, -1) if isinstance(drawn, tuple) else drawn.unsqueeze(-1)  # [B, ndim]
-        place = self._places(start, storage)
+        place = places_of(start, storage).cpu()
         weight = torch.as_tensor(self._sum_tree[place]) ** -self._beta
         start, place = start.to(left.device), place.to(left.device)
         index, info = padded_slices(start, left.flatten()[place], self.slice_len, rows=storage.shape[0])
@@ -105,7 +169,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         """Takes up the starts that have become complete since the last draw; returns the steps left from each step."""
         if self._left is None or self._revision != storage._mutation_revision:
             self._revision = storage._mutation_revision
-            complete, self._left = self._find(storage)
+            complete, self._left = self._rule.find(storage)
             complete = complete.flatten().cpu()
             new = (complete & ~self._starts[: len(complete)]).nonzero().squeeze(-1)
             self._starts[new] = True
@@ -113,31 +177,10 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
                 super().update_priority(new, self.default_priority)
         return self._left
 
-    def _find(self, storage: Storage) -> tuple[Tensor, Tensor]:
-        """Whether each stored step begins a complete sequence, and how many of its steps are real, ``[rows, N]``."""
-        stored, newest, length = storage[:], storage._last_cursor_index, self.slice_len
-        rows = (len(stored), -1)
-        episode, done = stored.get(self.traj_key).view(rows), stored.get(self.done_key).view(rows)
-        left, ended = steps_left(episode, done, newest)
-        complete = ended | (left >= length)
-        if self.terminated_key is not None:
-            complete &= (left > 1) | stored.get(self.terminated_key).view(rows)
-        if self.sampling == "steps":
-            return complete, left
-        init = stored.get(self.init_key).view(rows)
-        if self.sampling == "whole_episodes":
-            return init & complete, left
-        return episode_starts(init, episode, done, newest, length), torch.full_like(left, length)
-
-    @staticmethod
-    def _places(index: Tensor, storage: Storage) -> Tensor:
-        """Places in the tree of steps ``[M, ndim]``."""
-        return index[:, 0].cpu() if storage.ndim == 1 else (index[:, 0] * storage.shape[1] + index[:, 1]).cpu()
-
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
         """Forgets the priorities of steps that were overwritten."""
         assert isinstance(index, Tensor) and storage is not None
-        place = self._places(index.view(-1, storage.ndim), storage)
+        place = places_of(index.view(-1, storage.ndim), storage).cpu()
         self._starts[place] = False
         self._sum_tree[place] = 0.0
 
@@ -151,7 +194,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
             storage: the storage.
         """
         assert isinstance(index, Tensor) and isinstance(priority, Tensor) and storage is not None
-        place = self._places(index, storage)
+        place = places_of(index, storage).cpu()
         there = self._starts[place]
         if there.any():
             super().update_priority(place[there], priority.cpu()[there])
@@ -176,7 +219,7 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
             ValueError: if it is of another capacity, or holds something other than priorities.
         """
         priorities, starts = (state_dict[name].cpu() for name in ("priorities", "starts"))  # where the trees are
-        self._check_state(priorities, starts, state_dict["largest"])
+        check_priorities(priorities, starts, state_dict["largest"], capacity=self._max_capacity)
         self._empty()
         self._starts = starts.clone()
         known = self._starts.nonzero().squeeze(-1)
@@ -184,14 +227,3 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
             self._sum_tree[known] = self._min_tree[known] = priorities[known]
         if state_dict["largest"] is not None:
             self._max_priority = (torch.tensor(state_dict["largest"]), None)
-
-    def _check_state(self, priorities: Tensor, starts: Tensor, largest: float | None) -> None:
-        shape = (self._max_capacity,)
-        if priorities.shape != shape or starts.shape != shape or starts.dtype != torch.bool:
-            raise ValueError(
-                f"stored priorities must be those of {self._max_capacity} steps, got {list(priorities.shape)} and "
-                f"{list(starts.shape)}; load them with the capacity and num_envs that they were saved with."
-            )
-        known = priorities[starts]
-        if not (torch.isfinite(known) & (known > 0)).all() or not (largest is None or 0 <= largest < float("inf")):
-            raise ValueError("stored priorities must be finite and > 0, got others; use another checkpoint.")

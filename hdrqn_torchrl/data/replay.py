@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.data.device_priorities import DevicePrioritySampler
 from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
 from hdrqn_torchrl.data.samplers import (
     EpisodeSliceSampler,
@@ -19,11 +21,12 @@ from hdrqn_torchrl.data.samplers import (
     WholeEpisodeSampler,
 )
 from hdrqn_torchrl.data.storage import SequenceStorage
+from hdrqn_torchrl.devices import on_host
 
 Sampling = Literal["steps", "episodes", "episode_starts", "whole_episodes"]
 FROM_STARTS = ("episode_starts", "whole_episodes")
 """Kinds of sampling whose sequences all begin where an episode does, so that the zero state is exact."""
-AnySampler = StepSliceSampler | EpisodeStartSampler | PrioritizedSequenceSampler
+AnySampler = StepSliceSampler | EpisodeStartSampler | PrioritizedSequenceSampler | DevicePrioritySampler
 
 
 class SequenceBuffer(TensorDictReplayBuffer):
@@ -110,8 +113,8 @@ def make_sequence_buffer(
             ``"episode_starts"``: from the start of a random episode on, and into the next ones
             (:class:`EpisodeStartSampler`); ``"whole_episodes"``: the same, padded after the episode's end
             (:class:`WholeEpisodeSampler`).
-        priority_exponent, importance_exponent: draw sequences by priority, see :class:`PrioritizedSequenceSampler`;
-            ``None``: all alike.
+        priority_exponent, importance_exponent: draw sequences by priority, see :class:`PrioritizedSequenceSampler`
+            (on a GPU :class:`~hdrqn_torchrl.data.device_priorities.DevicePrioritySampler`); ``None``: all alike.
         traj_key: entry that numbers the episodes.
         done_key: last transition of an episode; read where sequences run on, or are drawn by priority.
         terminated_key: if given, sequences do not begin with the last stored transition of an episode unless this flag
@@ -149,7 +152,10 @@ def make_sequence_buffer(
             "which picks an episode first."
         )
     else:
-        sampler = PrioritizedSequenceSampler(
+        kind = PrioritizedSequenceSampler
+        if not on_host(torch.empty(0, device=device)):
+            kind = partial(DevicePrioritySampler, device=device)  # type: ignore[assignment]
+        sampler = kind(
             storage.max_size,
             slice_len=length,
             sampling=sampling,

@@ -9,6 +9,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import on_host
 
 
 def episode_starts(init: Tensor, episode: Tensor, done: Tensor, newest: int, length: int) -> Tensor:
@@ -35,12 +36,17 @@ def episode_starts(init: Tensor, episode: Tensor, done: Tensor, newest: int, len
     # Where one episode follows another that has not ended, steps between them were lost.
     gap = ((episode != episode.roll(-1, 0)) | init.roll(-1, 0)) & ~done
     gap[newest] = False
-    if length > 1 and gap.any():
-        spoilt = gap
-        for _ in range(length - 2):
-            spoilt = gap | spoilt.roll(-1, 0)
-        starts &= ~spoilt
+    if length > 1 and (not on_host(gap) or gap.any()):
+        starts &= ~_within(gap, newest, length - 1)
     return starts
+
+
+def _within(mark: Tensor, newest: int, steps: int) -> Tensor:
+    """Whether one of so many steps of a ring, from each on, is marked, ``[rows, N]``."""
+    time = (torch.arange(len(mark), device=mark.device) - newest - 1).remainder(len(mark))  # 0: the oldest
+    ahead = torch.where(mark, time.unsqueeze(-1), 2 * len(mark)).roll(-newest - 1, 0)
+    following = ahead.flip(0).cummin(0).values.flip(0).roll(newest + 1, 0)
+    return following < time.unsqueeze(-1) + steps
 
 
 def steps_left(episode: Tensor, done: Tensor, newest: int) -> tuple[Tensor, Tensor]:

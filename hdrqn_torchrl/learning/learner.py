@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -16,7 +15,14 @@ from hdrqn_torchrl.data import Continuity, sample_sequences
 from hdrqn_torchrl.data.device_draws import DeviceDraws
 from hdrqn_torchrl.learning.captured import Captured, wants_capture
 from hdrqn_torchrl.learning.finite import FiniteGuard
-from hdrqn_torchrl.learning.memory import Extract, make_longer_episodes, make_memory, warn_incomplete, warn_longer
+from hdrqn_torchrl.learning.memory import (
+    Extract,
+    make_longer_episodes,
+    make_memory,
+    warn_incomplete,
+    warn_longer,
+    warn_old_memory,
+)
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision
 from hdrqn_torchrl.learning.settings import LearnerSettings
@@ -40,10 +46,12 @@ class Learner:
         episode_len: largest number of transitions of an episode, if known (see
             :func:`~hdrqn_torchrl.data.make_sequence_buffer`).
         refresh: applied to every minibatch before it is learned from.
+        refresh_reads: whether the host reads values in ``refresh``, so that it can't be captured.
         separate: parts of the network, by prefixes of their parameters' names, that are optimised separately: with
             this share of the learning rate, and with gradients clipped by their own norm.
         samples_per_draw: minibatches drawn at once, independently: one large draw costs little more than a small one.
-            Priorities are those of the draw: up to ``samples_per_draw - 1`` updates old.
+            Priorities are those of the draw: up to ``samples_per_draw - 1`` updates old. A captured draw is of one
+            minibatch, by the priorities of that moment.
 
     Examples:
         See :func:`hdrqn_torchrl.algorithms.make_drqn`, which builds one.
@@ -59,6 +67,7 @@ class Learner:
         num_envs: int | None = None,
         episode_len: int | None = None,
         refresh: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        refresh_reads: bool = True,
         separate: Mapping[str, float] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
@@ -93,7 +102,7 @@ class Learner:
         )
         self._captured = Captured(self._gradient_step) if captures else None
         self._sequence_len = (settings.slice_len or 0) + getattr(loss, "lookahead", 0)
-        draws = captures and refresh is None and settings.priority_exponent is None
+        draws = captures and not (refresh is not None and refresh_reads)
         self._draws = (
             DeviceDraws(self.buffer, sequences=settings.batch_size, length=self._sequence_len) if draws else None
         )
@@ -201,10 +210,15 @@ class Learner:
 
     def _gradient_step(self, sample: TensorDictBase | None, ahead: int | None) -> dict[str, Tensor]:
         """What is captured: the update, and the draw if there is no ``sample``."""
-        if sample is None:
-            assert self._draws is not None
-            sample = self._draws.draw()
-        return self._step(sample, self.precision, ahead)
+        if sample is not None:
+            return self._step(sample, self.precision, ahead)
+        assert self._draws is not None
+        sample = self._draws.draw()
+        report = self._step(sample if self.refresh is None else self.refresh(sample), self.precision, ahead)
+        priority = report.pop("priority", None)
+        if self.settings.priority_exponent is not None and priority is not None:
+            self._draws.set_priorities(sample, priority)
+        return report
 
     @property
     def is_whole(self) -> bool:
@@ -256,11 +270,7 @@ class Learner:
         if self._captured is not None:
             self._captured.reset()
         if holds_inputs_twice(state["buffer"], self.loss.in_keys):
-            warnings.warn(
-                "the stored replay memory is of an earlier version, which kept each observation twice; it begins empty "
-                "and is warmed up again, so that the training goes on, but not bit for bit as it would have.",
-                stacklevel=3,
-            )
+            warn_old_memory()
             self.begin_empty()
             return
         self.buffer.load_state_dict(state["buffer"])

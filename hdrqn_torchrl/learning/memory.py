@@ -91,6 +91,15 @@ def warn_incomplete(settings: LearnerSettings, length: int) -> None:
     )
 
 
+def warn_old_memory() -> None:
+    """A stored memory can't be used."""
+    warnings.warn(
+        "the stored replay memory is of an earlier version, which kept each observation twice; it begins empty "
+        "and is warmed up again, so that the training goes on, but not bit for bit as it would have.",
+        stacklevel=4,
+    )
+
+
 def _ends(loss: LossModule, *, rows: bool) -> tuple[NestedKey, NestedKey | None]:
     """Under ``"next"``: end of an episode; without which flag its last transition has no target, if that may be so.
 

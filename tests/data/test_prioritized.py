@@ -14,6 +14,14 @@ SAMPLINGS = ["steps", "episode_starts", "whole_episodes"]
 ALPHA, FLOOR = 0.7, 1e-3
 
 
+@pytest.fixture(autouse=True, params=["trees", "tensors"])
+def kind(request):
+    """Priorities lie in trees of the host, or in tensors, as on a GPU."""
+    if request.param == "tensors":
+        request.getfixturevalue("as_on_gpu")
+    return request.param
+
+
 class World:
     """Environments whose episodes have drawn lengths, a prioritised memory of them, and which steps are stored when."""
 

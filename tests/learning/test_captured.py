@@ -34,6 +34,18 @@ def make_learners(name: str, levels: int, **settings) -> dict[str, Learner]:
     return algorithm.learners
 
 
+def with_hindsight() -> dict[str, Learner]:
+    """v2's learners, whose sub level learns about every subgoal from each sequence."""
+    torch.manual_seed(0)
+    env = small_env(8, max_steps=5, obstacle="teleport")
+    algorithm = build("v2", env, settings=tiny_settings(), max_option_steps=2, sub_hindsight=True, meta_hindsight=True)
+    batch = collect(algorithm, env, 10)[0]
+    for learner in algorithm.learners.values():
+        learner.guard.at_once = False
+        learner.store(batch)
+    return algorithm.learners
+
+
 def learn(learner: Learner, updates: int) -> list[dict[str, float]]:
     """Updates at a falling learning rate."""
     reports = []
@@ -65,6 +77,22 @@ class TestCapturedUpdates:
             states = [each.loss.state_dict() for each in (learner, plain[level])]
             assert all(torch.equal(states[0][key], states[1][key]) for key in states[1] if key != "__batch_size")
             assert any(piece._results for piece in learner._captured._pieces.values())
+
+    @pytest.mark.parametrize("kind", ["priorities", "hindsight"])
+    def test_draws_by_priority_and_with_hindsight_belong_to_the_graph(self, kind, capturing):
+        make = partial(make_learners, "v2", 2, priority_exponent=0.9) if kind == "priorities" else with_hindsight
+        captured, plain = (make() for _ in "ab")
+        for level, learner in captured.items():
+            plain[level]._captured = plain[level]._gradient_step
+            results = []
+            for each in (learner, plain[level]):
+                torch.manual_seed(5)
+                results.append(learn(each, 8))
+            assert results[0] == results[1] and learner._drawn == []
+            states = [each.buffer.state_dict()["_sampler"] for each in (learner, plain[level])]
+            if kind == "priorities":
+                assert all(torch.equal(*(state[name] for state in states)) for name in ("priorities", "starts"))
+                assert len(states[0]["priorities"].unique()) > 4
 
     def test_a_fault_is_reported_with_its_place_and_changes_no_weight(self, capturing):
         learner = make_learners("drqn", 2)["flat"]
