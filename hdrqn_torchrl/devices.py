@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 import numpy
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 
 WORKSPACE = "CUBLAS_WORKSPACE_CONFIG"
@@ -23,6 +26,99 @@ def on_host(tensor: Tensor) -> bool:
     the work is always done.
     """
     return tensor.device.type == "cpu"
+
+
+def to_device(data: Any, device: torch.device | None) -> Any:
+    """A tensor or TensorDict of the host on a device. A GPU copies it from pinned memory; the host does not wait.
+
+    Args:
+        data: where it is now.
+        device: where it is to be; ``None``: where it is.
+
+    Examples:
+        >>> to_device(torch.ones(2), torch.device("cpu")).tolist()
+        [1.0, 1.0]
+    """
+    if device is None or device.type != "cuda":
+        return data if device is None else data.to(device)
+    if isinstance(data, TensorDictBase):
+        return data.apply(partial(to_device, device=device), device=device)
+    return data.pin_memory().to(device, non_blocking=True) if data.device.type == "cpu" else data.to(device)
+
+
+class Arriving:
+    """A tensor on its way to the host, which does other work meanwhile.
+
+    A GPU copies it, as it is now, into pinned memory when it comes to it; a host that asks waits for this copy, and not
+    for what was begun since.
+
+    Args:
+        tensor: of any device.
+
+    Examples:
+        >>> total = torch.ones(2)
+        >>> arriving = Arriving(total)
+        >>> _ = total.zero_()
+        >>> arriving.get().tolist()
+        [1.0, 1.0]
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        self._event: torch.cuda.Event | None = None
+        if tensor.device.type != "cuda":
+            self._copy = tensor.clone()
+        else:
+            self._copy = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record()
+
+    def get(self) -> Tensor:
+        """The tensor on the host."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._copy
+
+    def truth(self) -> bool:
+        """Of a tensor of one element."""
+        return bool(self.get())
+
+
+class LateCheck:
+    """Asks whether something is wrong: a host at once, a GPU when the next question is asked.
+
+    The answer has arrived by then, so that the host never waits for the work that it has just begun.
+
+    Examples:
+        >>> LateCheck().ask(torch.tensor(True), lambda: print("wrong"))
+        wrong
+    """
+
+    def __init__(self) -> None:
+        self._open: tuple[Arriving, Callable[[], None]] | None = None
+
+    def ask(self, wrong: Tensor, refuse: Callable[[], None]) -> None:
+        """Asks one more question, and finds the answer to the last one.
+
+        Args:
+            wrong: ``[]`` bool.
+            refuse: called if it is so; raises an error that says what is wrong.
+        """
+        if on_host(wrong):
+            if wrong:
+                refuse()
+            return
+        self.settle()
+        self._open = Arriving(wrong), refuse
+
+    def settle(self) -> None:
+        """Finds the answer to the last question, if it is not known yet."""
+        last, self._open = self._open, None
+        if last is not None and last[0].truth():
+            last[1]()
+
+    def forget(self) -> None:
+        """The last question no longer matters."""
+        self._open = None
 
 
 def multiplies_bfloat16(kind: str) -> bool:

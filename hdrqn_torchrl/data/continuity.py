@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import LateCheck
 
 
 class Continuity:
@@ -41,18 +44,20 @@ class Continuity:
         option_done_key: NestedKey = keys.OPTION_DONE,
     ) -> None:
         self.traj_key, self.init_key, self.option_done_key = traj_key, init_key, option_done_key
+        self._check = LateCheck()
         self.reset()
 
     def reset(self) -> None:
         """Accepts any next batch."""
         self._episode: Tensor | None = None  # [N, 1]: that of the last step, ...
         self._over: Tensor | None = None  # [N, 1]: ... and whether it was over
+        self._check.forget()
 
     def check(self, batch: TensorDictBase) -> None:
         """Looks at the next batch.
 
         Raises:
-            ValueError: if it does not continue the last one.
+            ValueError: if it does not continue the last one; on a GPU, the next call says so.
         """
         if batch.ndim != 2:
             raise ValueError(
@@ -74,8 +79,7 @@ class Continuity:
             jumps = (jumps | ends[:, :-1]) & ~starts.squeeze(-1)
         option_done = batch.get("next").get(self.option_done_key, None)
         left_open = torch.zeros_like(over) if option_done is None else over & ~option_done.squeeze(-1)
-        if (jumps | left_open).any():  # one question, as a GPU has to be waited for
-            _refuse(jumps, left_open, episodes, ends)
+        self._check.ask((jumps | left_open).any(), partial(_refuse, jumps, left_open, episodes, ends))
         self._episode, self._over = episode[:, -1:].clone(), over[:, -1:].clone()
 
 

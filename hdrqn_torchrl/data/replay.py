@@ -43,7 +43,15 @@ class SequenceBuffer(TensorDictReplayBuffer):
             ValueError: if they are not of the shape that the memory was built for.
         """
         self._storage.check_shape(tensordicts)
-        return self._extend(tensordicts[..., -self._storage.rows :])
+        written = tensordicts[..., -self._storage.rows :]
+        if not on_host(next(written.values(True, True))):
+            self._storage.newest = (self._writer._cursor + written.shape[-1] - 1) % self._storage.rows
+        index = self._extend(written)
+        self._storage.newest = None
+        return index
+
+    keeps_starts: bool = False
+    """Whether a sequence can always be drawn once one could."""
 
     def can_sample(self) -> bool:
         """Whether a sequence can be drawn by now."""
@@ -165,7 +173,10 @@ def make_sequence_buffer(
             done_key=done_key,
             terminated_key=terminated_key,
         )
-    return SequenceBuffer(storage=storage, sampler=sampler, batch_size=batch_size * length)
+    buffer = SequenceBuffer(storage=storage, sampler=sampler, batch_size=batch_size * length)
+    known = episode_len is not None if sampling in FROM_STARTS else terminated_key is None and priority_exponent is None
+    buffer.keeps_starts = num_envs is not None and known
+    return buffer
 
 
 def _check_capacity(

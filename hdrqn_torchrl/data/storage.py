@@ -31,6 +31,12 @@ class SequenceStorage(LazyTensorStorage):
         self.rows = -(-capacity // (num_envs or 1))
         super().__init__(self.rows * (num_envs or 1), ndim=1 + len(self.row_shape), device=device)
 
+    newest: int | None = None
+    """Row that is about to be written last, if the host knows it; otherwise it would ask the device for it."""
+
+    def _set_last_cursor(self, cursor: Any) -> None:
+        super()._set_last_cursor(cursor if self.newest is None else self.newest)
+
     def check_shape(self, transitions: TensorDictBase) -> None:
         """Refuses transitions that are not ``[N, T]`` of N environments, or ``[M]``.
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import LateCheck, on_host
 
 
 class NonFiniteError(ArithmeticError):
@@ -43,7 +45,10 @@ class FiniteGuard:
         self._first: Tensor | None = None  # its loss, its largest gradients, and its place in _places
         self._count: Tensor | None = None  # updates since the last check
         self._names: list[str] = []
-        self._places: list[str] = []
+        self._places: list[str] = []  # of updates since the last check, or since the last answer
+        self._dropped = 0  # updates since the last check that are known to be sound
+        self._asked = 0  # of those in _places, how many the question is about whose answer is on its way
+        self._late = LateCheck()
 
     def begin(self, place: str) -> None:
         """Takes note, on the host, of which update is next.
@@ -94,12 +99,33 @@ class FiniteGuard:
         Raises:
             NonFiniteError: naming what was not finite, and the first update in which it was not.
         """
-        if self._found is not None and self._first is not None and self._found > 0:
-            loss, *largest, place = self._first.unbind()
-            raise NonFiniteError(self._explain(loss, largest, self._names, self._places[int(place)]))
+        self._late.forget()
+        if self._found is not None and self._found > 0:
+            self._refuse()
         self._places.clear()
+        self._dropped = self._asked = 0
         if self._count is not None:
             self._count.zero_()
+
+    def check_late(self) -> None:
+        """As :meth:`check`, but a GPU is not waited for: a fault may be told at the next call only.
+
+        Raises:
+            NonFiniteError: as there.
+        """
+        if self._found is None or on_host(self._found):
+            self.check()
+            return
+        number = len(self._places)
+        self._late.ask(self._found > 0, self._refuse)
+        del self._places[: self._asked]  # by the last question, to which the answer was no
+        self._dropped += self._asked
+        self._asked = number - self._asked
+
+    def _refuse(self) -> None:
+        assert self._first is not None
+        loss, *largest, place = self._first.unbind()
+        raise NonFiniteError(self._explain(loss, largest, self._names, self._places[int(place) - self._dropped]))
 
     @staticmethod
     def _explain(loss: Tensor, largest: Sequence[Tensor], names: Sequence[str], place: str) -> str:
@@ -116,18 +142,30 @@ def _largest(gradients: Mapping[str, Tensor]) -> Sequence[Tensor]:
     return torch._foreach_norm(list(gradients.values()), torch.inf)
 
 
-def check_batch(batch: TensorDictBase, frames: int) -> None:
+def check_batch(batch: TensorDictBase, frames: int, late: LateCheck | None = None) -> None:
     """Refuses a collected batch ``[N, T]`` with a NaN or an infinity in it.
+
+    Args:
+        batch: what was collected.
+        frames: before it.
+        late: where the question is asked; ``None``: here and now.
 
     Raises:
         NonFiniteError: naming the place and the entry that came first; others follow from it.
     """
-    floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
-    if torch.stack([torch.isfinite(value).all() for value in floats.values()]).all():
-        return
+    floats = [value for value in batch.values(True, True) if value.is_floating_point()]
+    wrong = ~torch.stack([torch.isfinite(value).all() for value in floats]).all()
+    refuse = partial(_refuse_batch, batch, frames)
+    if late is not None:
+        late.ask(wrong, refuse)
+    elif wrong:
+        refuse()
+
+
+def _refuse_batch(batch: TensorDictBase, frames: int) -> None:
     found = []
-    for key, value in floats.items():
-        if not torch.isfinite(value).all():
+    for key, value in batch.items(True, True):
+        if value.is_floating_point() and not torch.isfinite(value).all():
             wrong = ~torch.isfinite(value).reshape(*batch.shape, -1).all(-1)
             time, environment = wrong.t().nonzero()[0].tolist()
             name = ".".join(key) if isinstance(key, tuple) else key

@@ -13,6 +13,7 @@ from torchrl.objectives import HardUpdate, LossModule
 
 from hdrqn_torchrl.data import Continuity, sample_sequences
 from hdrqn_torchrl.data.device_draws import DeviceDraws
+from hdrqn_torchrl.devices import to_device
 from hdrqn_torchrl.learning.captured import Captured, wants_capture
 from hdrqn_torchrl.learning.finite import FiniteGuard
 from hdrqn_torchrl.learning.memory import (
@@ -20,7 +21,7 @@ from hdrqn_torchrl.learning.memory import (
     make_longer_episodes,
     make_memory,
     warn_incomplete,
-    warn_longer,
+    warn_of_longer,
     warn_old_memory,
 )
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
@@ -71,6 +72,7 @@ class Learner:
         separate: Mapping[str, float] | None = None,
         samples_per_draw: int = 8,
     ) -> None:
+        settings = settings.scaled()
         self.network, self.settings, self.loss, self.extract, self.refresh = network, settings, loss, extract, refresh
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
@@ -112,14 +114,12 @@ class Learner:
         self.held = False
         """Whether it only stores; updates missed meanwhile are not made up for."""
         self._warm_at = settings.warmup_frames  # or when a sequence could be drawn, if that was later
-        self._has_warned = False
+        self._has_warned = self._could_draw = False
 
     @property
     def learning_rate(self) -> float:
         """Adam's rate at the frames seen so far."""
-        start, end = self.settings.learning_rate, self.settings.learning_rate_end
-        progress = min(1.0, self.frames / self.settings.learning_rate_frames)
-        return start if end is None else start + (end - start) * progress
+        return self.settings.rate_at(self.frames)
 
     def store(self, batch: TensorDictBase) -> None:
         """Puts into the replay memory what this level learns from in ``batch`` ``[N, T]``.
@@ -129,9 +129,9 @@ class Learner:
                 the last one ended (:class:`~hdrqn_torchrl.data.Continuity`).
             NonFiniteError: as :meth:`check_finite`.
         """
-        self.check_finite()
+        self.check_finite(late=True)
         if batch.device != self.device:  # a collector without a device of its own numbers its episodes on the host
-            batch = batch.to(self.device)
+            batch = to_device(batch, self.device)
         self._continuity.check(batch)
         self.frames += batch.numel()
         self._drawn = []
@@ -145,9 +145,7 @@ class Learner:
             ) from error
         if transitions is not None:
             self.buffer.extend(transitions)
-            if self._longer is not None and self._longer.seen(transitions):
-                self._longer = None  # once is enough
-                warn_longer(self.settings)
+            self._longer = warn_of_longer(self._longer, transitions, self.settings)
         if self._frames_owed > 0 and (self.held or not self._can_draw()):
             self._warm_at += math.ceil(self._frames_owed)
 
@@ -158,12 +156,13 @@ class Learner:
 
     def _can_draw(self) -> bool:
         """Whether the memory holds a sequence; warns once where it is full of others."""
-        if self.buffer.can_sample():
-            return True
-        if self.buffer.is_full() and not self._has_warned:
+        if self._could_draw and self._draws is not None and self.buffer.keeps_starts:
+            return True  # without asking the device
+        self._could_draw = self.buffer.can_sample()
+        if not self._could_draw and self.buffer.is_full() and not self._has_warned:
             self._has_warned = True
             warn_incomplete(self.settings, self._sequence_len)
-        return False
+        return self._could_draw
 
     def updates_due(self) -> int:
         """How many updates are owed for the frames seen so far; none while no sequence can be drawn."""
@@ -229,15 +228,16 @@ class Learner:
         """Makes the target network the same as the one that is trained."""
         HardUpdate(self.loss, value_network_update_interval=1).step()
 
-    def check_finite(self) -> None:
-        """Looks at all updates since the last call, on devices where :meth:`update` does not look at each.
+    def check_finite(self, *, late: bool = False) -> None:
+        """Looks at all updates since the last call, where :meth:`update` does not; :meth:`state_dict` calls it, too.
 
-        :meth:`store` and :meth:`state_dict` call it, too.
+        Args:
+            late: as :meth:`store`: without waiting for what was begun since the last such call.
 
         Raises:
             NonFiniteError: as :meth:`update`.
         """
-        self.guard.check()
+        self.guard.check_late() if late else self.guard.check()
 
     def state_dict(self, *, memory: bool = True) -> dict[str, Any]:
         """All that learning depends on: both networks, optimiser, replay memory, counters.
@@ -274,7 +274,7 @@ class Learner:
             self.begin_empty()
             return
         self.buffer.load_state_dict(state["buffer"])
-        self._drawn, self._warm_at = list(state["drawn"]), state["warm_at"]
+        self._drawn, self._warm_at, self._could_draw = list(state["drawn"]), state["warm_at"], False
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up again.
@@ -307,4 +307,5 @@ class Learner:
         if len(self.buffer):
             self.buffer.empty()
         done = math.ceil(self.updates * self.settings.frames_per_update)
+        self._could_draw = False
         self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)

@@ -71,14 +71,23 @@ def make_longer_episodes(
     return LongerEpisodes(settings.slice_len, done_key=done_key, terminated_key=terminated_key or keys.TERMINATED)
 
 
-def warn_longer(settings: LearnerSettings) -> None:
-    """An episode has transitions that no sequence from its start will ever show."""
+def warn_of_longer(
+    longer: LongerEpisodes | None, transitions: TensorDictBase, settings: LearnerSettings
+) -> LongerEpisodes | None:
+    """Warns once that an episode has transitions that no sequence from its start will ever show.
+
+    Returns:
+        What goes on looking; ``None`` once it has warned.
+    """
+    if longer is None or not longer.seen(transitions):
+        return longer
     warnings.warn(
         f"slice_len should cover an episode with sampling={settings.sampling!r}, got {settings.slice_len} where one "
         "has more transitions; the later ones are never learned from: raise slice_len, or use sampling='steps' with "
         "stored_state=True.",
         stacklevel=4,
     )
+    return None
 
 
 def warn_incomplete(settings: LearnerSettings, length: int) -> None:

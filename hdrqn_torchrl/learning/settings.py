@@ -28,6 +28,8 @@ class LearnerSettings:
             Transitions beyond them that the targets need are also drawn (:meth:`lookahead`). ``None``, for v3 only:
             what suits the task (see :func:`~hdrqn_torchrl.algorithms.make_v3`).
         batch_size: number of sequences in a minibatch.
+        batch_scale: minibatches are so many times as large, and updates so many times as rare: each step is replayed as
+            often. For many worlds on a GPU, which takes a large minibatch in little more time than a small one.
         capacity: number of transitions that the replay memory holds.
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
         warmup_frames: environment frames before the first update.
@@ -65,6 +67,7 @@ class LearnerSettings:
 
     slice_len: int | None = 8
     batch_size: int = 32
+    batch_scale: int = 1
     capacity: int = 100_000
     frames_per_update: float = 8.0
     warmup_frames: int = 5_000
@@ -93,6 +96,7 @@ class LearnerSettings:
         rules = (
             ("slice_len", slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
             ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
+            ("batch_scale", self.batch_scale >= 1, ">= 1", "use 1"),
             ("capacity", self.capacity >= slice_len, ">= slice_len", "use 100000 for steps, 50000 for options"),
             ("frames_per_update", self.frames_per_update > 0, "> 0", "use 8"),
             ("warmup_frames", self.warmup_frames >= 0, ">= 0", "use 5000"),
@@ -136,6 +140,25 @@ class LearnerSettings:
         for name, holds, rule, remedy in rules:
             if not holds:
                 raise ValueError(f"{name} must be {rule}, got {getattr(self, name)}; {remedy}.")
+
+    def scaled(self) -> LearnerSettings:
+        """The same settings without ``batch_scale``: what it means is in the others.
+
+        Examples:
+            >>> settings = LearnerSettings(batch_size=32, frames_per_update=20, batch_scale=4).scaled()
+            >>> settings.batch_size, settings.frames_per_update
+            (128, 80)
+        """
+        if self.batch_scale == 1:
+            return self
+        size, frames = self.batch_scale * self.batch_size, self.batch_scale * self.frames_per_update
+        return replace(self, batch_size=size, frames_per_update=frames, batch_scale=1)
+
+    def rate_at(self, frames: int) -> float:
+        """Adam's rate after so many frames."""
+        start, end = self.learning_rate, self.learning_rate_end
+        progress = min(1.0, frames / self.learning_rate_frames)
+        return start if end is None else start + (end - start) * progress
 
     def lookahead(self, trace_decay: float | None = None) -> int:
         """Number of transitions drawn beyond ``slice_len``, so that targets are not cut short.

@@ -123,10 +123,15 @@ class EpisodeTracker:
 
     def finished(self, batch: TensorDictBase) -> TensorDictBase:
         """Takes a collected batch ``[N, T]``; returns the episodes ``[M]`` that ended in it."""
+        sums, ended = self.follow(batch)
+        return sums[ended]
+
+    def follow(self, batch: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
+        """Takes a collected batch ``[N, T]``; returns sums up to each step and whether it is the last, ``[T, N]``."""
         self._forget(batch.get(keys.IS_INIT, None))
         after = batch.get("next").transpose(0, 1)  # [T, N]
         sums: TensorDictBase = torch.stack([self.add(step) for step in after.unbind(0)], 0)  # type: ignore[assignment]
-        return sums[after.get(keys.DONE).squeeze(-1)]
+        return sums, after.get(keys.DONE).squeeze(-1)
 
     def _forget(self, init: Tensor | None) -> None:
         """Clears the sums of episodes that were lost between two batches: others begin in their rows ``[N, T, 1]``."""

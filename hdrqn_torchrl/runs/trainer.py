@@ -18,11 +18,12 @@ from torchrl.collectors import BaseCollector
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.learning import Monitor
-from hdrqn_torchrl.learning.finite import NonFiniteError, check_batch, naming
+from hdrqn_torchrl.learning.finite import NonFiniteError, naming
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
 from hdrqn_torchrl.runs.components import components_of
 from hdrqn_torchrl.runs.evaluation import EpisodeTracker
+from hdrqn_torchrl.runs.incoming import Incoming
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.saving import Saving
@@ -77,6 +78,7 @@ class Trainer:
         self.frames, self.episodes, self.best_return = 0, 0, -float("inf")
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
         self._tracker = EpisodeTracker(algorithm.task)
+        self._incoming = Incoming(self._tracker)
         self._window = Window()
         self._stop = stop or StopRequest()
         self._started = time.monotonic()
@@ -89,7 +91,7 @@ class Trainer:
 
     @property
     def wall_seconds(self) -> float:
-        """Seconds of training, those before an interruption included."""
+        """Seconds of training, interruptions left out."""
         return time.monotonic() - self._started
 
     @property
@@ -156,7 +158,7 @@ class Trainer:
             try:
                 if (batch := next(batches, None)) is None:
                     return
-                check_batch(batch, self.frames)
+                self._incoming.check(batch, self.frames)
             except Exception as error:
                 self.collector.give_up(self.frames)
                 self._saving.save_after(error, self.frames)
@@ -165,19 +167,18 @@ class Trainer:
 
     def step(self, batch: TensorDictBase) -> None:
         """One iteration on a collected batch ``[N, T]``."""
-        check_batch(batch, self.frames)
+        self._incoming.check(batch, self.frames)
         self._receive(batch)
         for _ in self._complete_iteration():
             pass
 
     def _receive(self, batch: TensorDictBase) -> None:
         """Counts and stores a collected batch ``[N, T]``."""
+        self._incoming.check_late(batch, self.frames)
         with self._saving.in_parts():
             self.frames += batch.numel()
             self.algorithm.observe(batch)
-            finished = self._tracker.finished(batch)
-            self.episodes += len(finished)
-            self._window.add_episodes(finished)
+            self.episodes += self._window.add_episodes(self._incoming.take(batch))
 
     def _complete_iteration(self) -> Iterator[None]:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""
@@ -188,7 +189,7 @@ class Trainer:
                     self._window.add_update(name, learner.learn())
             yield
             with naming(name):
-                learner.check_finite()
+                learner.check_finite(late=self.frames < self.total_frames)
         self.collector.update_policy_weights_()
         before, best = self._completed, False
         if before != self.frames:
@@ -208,6 +209,7 @@ class Trainer:
 
     def log(self, *, evaluation: bool) -> bool:
         """Writes one log point, after a greedy evaluation if asked for. Returns whether that was the best so far."""
+        self.episodes += self._window.add_episodes(self._incoming.settle())
         row: Row = {
             "frames": self.frames,
             "episodes": self.episodes,
@@ -240,6 +242,7 @@ class Trainer:
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint, unless nothing happened since the last one (:meth:`Saving.save`)."""
+        self.episodes += self._window.add_episodes(self._incoming.settle())
         self._saving.save(self.frames, score=score)
 
     def resume(self, path: Path) -> None:
@@ -275,6 +278,7 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Its own counters; the parts have theirs."""
+        self.episodes += self._window.add_episodes(self._incoming.settle())
         return {
             "frames": self.frames,
             "episodes": self.episodes,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -38,10 +38,10 @@ class Window:
         self._sums: dict[str, dict[str, Tensor]] = {}
         self._counts: dict[str, int] = {}
 
-    def add_episodes(self, episodes: TensorDictBase) -> None:
-        """Takes the episodes ``[M]`` that ended (:meth:`~hdrqn_torchrl.runs.evaluation.EpisodeTracker.finished`)."""
-        if len(episodes):
-            self._episodes.append(episodes)
+    def add_episodes(self, found: Sequence[TensorDictBase]) -> int:
+        """Takes episodes ``[M]`` that ended (:class:`~hdrqn_torchrl.runs.incoming.Incoming`); returns how many."""
+        self._episodes += [episodes for episodes in found if len(episodes)]
+        return sum(map(len, found))
 
     def add_update(self, learner: str, metrics: dict[str, Tensor]) -> None:
         """Takes what one update of a learner returned."""
@@ -54,7 +54,7 @@ class Window:
         seconds = max(time.monotonic() - self._since, 1e-9)
         row: Row = {"frames_per_second": round((frames - self._frames) / seconds, 1)}
         if self._episodes:
-            episodes: TensorDictBase = torch.cat(self._episodes, 0)  # type: ignore[assignment]
+            episodes: TensorDictBase = torch.cat([each.cpu() for each in self._episodes], 0)  # type: ignore[assignment]
             row |= {f"behaviour/{name}": value.mean().item() for name, value in episodes.items()}
         for learner, sums in self._sums.items():
             count = self._counts[learner]

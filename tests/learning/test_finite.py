@@ -53,6 +53,18 @@ def test_finite_numbers_raise_nothing():
         guard.check()
 
 
+def test_a_late_check_names_the_update_at_its_next_call(as_on_gpu):
+    guard = FiniteGuard(at_once=False)
+    for number in range(1, 8):
+        watch(guard, f"update {number}", **({"loss": NAN} if number == 7 else {}))
+        if number % 2 == 0:
+            guard.check_late()
+    assert len(guard._places) < 7  # those known to be sound are forgotten
+    guard.check_late()
+    with pytest.raises(NonFiniteError, match=r"^the loss became nan in update 7$"):
+        guard.check_late()
+
+
 def quiet_batch():
     return TensorDict({"next": {"reward": torch.zeros(2, 5, 1)}}, [2, 5])
 

@@ -15,6 +15,7 @@ from torchrl.data import Categorical, Composite
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import to_device
 from hdrqn_torchrl.envs.gym.vectors import Worlds
 from hdrqn_torchrl.envs.gym.worlds import Entries, Reading
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
@@ -122,7 +123,7 @@ class GymTaskEnv(EnvBase):
 
     def _tensordict(self, entries: dict[str, NDArray]) -> TensorDict:
         """Copies of the arrays, flat ones ``[N]`` as columns ``[N, 1]``."""
-        tensors = {key: torch.tensor(array, device=self.device) for key, array in entries.items()}
+        tensors = {key: to_device(torch.tensor(array), self.device) for key, array in entries.items()}
         columns = {
             key: each.unsqueeze(-1) if each.ndim == 1 and key != keys.OBSERVATION else each
             for key, each in tensors.items()

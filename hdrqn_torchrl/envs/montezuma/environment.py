@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.devices import to_device
 from hdrqn_torchrl.envs.montezuma.emulators import Emulators, Snapshot
 from hdrqn_torchrl.envs.montezuma.practice import PracticeStarts
 from hdrqn_torchrl.envs.montezuma.screen import (
@@ -262,7 +263,7 @@ class MontezumaEnv(EnvBase):
 
     def _tensordict(self, entries: Mapping[str, NDArray]) -> TensorDict:
         """Copies of the arrays, flat ones ``[N]`` as columns ``[N, 1]``."""
-        tensors = {key: torch.tensor(array, device=self.device) for key, array in entries.items()}
+        tensors = {key: to_device(torch.tensor(array), self.device) for key, array in entries.items()}
         columns = {key: each.unsqueeze(-1) if each.ndim == 1 else each for key, each in tensors.items()}
         return TensorDict(columns, batch_size=self.batch_size, device=self.device)
 
