@@ -26,7 +26,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict, read_write
 
 try:
     import fcntl
@@ -37,6 +37,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 POLL_SECONDS = 1.0
 PATIENCE_SECONDS = 120.0
 """How long a job waits for another process in its folder: one of a killed sweep may still be saving itself."""
+JOBS_ON_A_GPU = 4
+"""Jobs that ``sweep=parallel`` runs at once on a GPU unless told how many: each has a context of its own there."""
 STARTED, DONE = "started", "done"
 NOT_STARTED = "not started, as the sweep was stopped"
 Note = dict[str, Any]
@@ -44,6 +46,17 @@ Note = dict[str, Any]
 
 class JobStopped(RuntimeError):
     """A job in a worker process was stopped on request. Unlike ``SystemExit`` this leaves the other workers alive."""
+
+
+def share_gpu(config: DictConfig) -> None:
+    """Lets fewer jobs run at once than there are cores, if they run on a GPU and nobody said how many."""
+    if config.hydra.launcher.get("n_jobs") != -1 or config.device == "cpu":
+        return
+    import torch
+
+    if torch.cuda.is_available():
+        with read_write(config.hydra), open_dict(config.hydra):
+            config.hydra.launcher.n_jobs = min(JOBS_ON_A_GPU, os.cpu_count() or 1)
 
 
 class Sweep(Callback):
@@ -57,6 +70,7 @@ class Sweep(Callback):
         ledger = ledger_of(config)
         self.ledger = ledger.absolute()  # jobs may have other working directories
         self.ledger.unlink(missing_ok=True)
+        share_gpu(config)
         atexit.register(report, ledger)  # Hydra leaves out on_multirun_end when a sweep ends with an exception
         if not config.hydra.launcher._target_.endswith(".BasicLauncher"):
             for number in SIGNALS:

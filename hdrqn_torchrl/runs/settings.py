@@ -71,6 +71,8 @@ class RunSettings:
     precision: str = "fp32"
     capture: Any = "auto"
     """Or ``True``, or ``False``."""
+    batch_scale: int = 1
+    """Of all learners (:class:`~hdrqn_torchrl.learning.LearnerSettings`)."""
     deterministic: bool = False
     """Whether a GPU repeats its numbers bit for bit."""
     total_frames: int
@@ -98,6 +100,7 @@ _LIMITS = (
     ("threads", 1, 1_024),
     ("steps_per_batch", 2, 100_000),  # TorchRL's two-dimensional storage can't take single steps
     ("log_frames", 1, 10**15),
+    ("batch_scale", 1, 10_000),
     ("seed", 0, 2**62),
     ("evaluation.num_envs", 1, 100_000),
     ("evaluation.episodes", 1, 10**9),

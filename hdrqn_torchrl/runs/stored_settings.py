@@ -24,6 +24,7 @@ _EARLIER: dict[str, tuple[str, Any]] = {
     "${total_frames}": ("total_frames", _MISSING),
     "${precision}": ("precision", _MISSING),
     "${capture}": ("capture", _MISSING),
+    "${batch_scale}": ("batch_scale", _MISSING),
     "${seed}": ("seed", _MISSING),
     "${steps_per_batch}": ("steps_per_batch", _MISSING),
     "${env.practice_steps}": ("env.practice_steps", _MISSING),
