@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 from torchrl.data import TensorSpec
 
+from hdrqn_torchrl.discovery.changes import make_change_detector
 from hdrqn_torchrl.discovery.critic import EventCritic
+from hdrqn_torchrl.discovery.events import EventSelection
 from hdrqn_torchrl.discovery.selection import Selection
+from hdrqn_torchrl.discovery.table import SubgoalTable
 from hdrqn_torchrl.modules.sizes import check_size
 
 
@@ -43,7 +46,9 @@ class DiscoverySettings:
             observation: spec of the observation ``[N, ...]``.
             num_actions: of the environment.
 
-        Raises:
-            ValueError: if events can't be told in observations of this kind.
+        Returns:
+            The critic, and the selection that reads its events.
         """
-        raise NotImplementedError
+        detector = make_change_detector(observation, num_actions, warmup_frames=self.warmup_frames)
+        selection = EventSelection(detector, max_subgoals=self.max_subgoals)
+        return EventCritic(detector, SubgoalTable(self.max_subgoals)), selection

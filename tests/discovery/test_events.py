@@ -1,0 +1,150 @@
+"""The choice of events that are subgoals."""
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from hdrqn_torchrl.discovery import ChangeDetector, EventSelection
+from hdrqn_torchrl.discovery.control import Control
+from hdrqn_torchrl.discovery.history import History, Occurrences, events_of
+
+KEY, DOOR, GOAL, NOISE, SHADE = 1, 2, 3, 4, 17
+PLACES = 10  # of two codes: tokens 1 to 4 belong to place 0
+MOVE, DO = 0, 1
+T = 20
+
+
+def make_selection(**settings):
+    detector = ChangeDetector((2,) * PLACES, 2)
+    detector.order.copy_(torch.arange(PLACES))
+    detector.moves[MOVE] = True
+    return EventSelection(detector, **settings)
+
+
+def episodes(*worlds, hazard=None):
+    """Episodes of one length; each is a list of (step, token, action, reward)."""
+    count = len(worlds)
+    tokens = torch.zeros(count, T, 5, dtype=torch.int64)
+    action, reward = torch.zeros(count, T, dtype=torch.int64), torch.zeros(count, T, 1)
+    done = torch.zeros(count, T, 1, dtype=torch.bool)
+    done[:, -1] = True
+    for world, events in enumerate(worlds):
+        for step, token, act, paid in events:
+            tokens[world, step, int((tokens[world, step] > 0).sum())] = token
+            action[world, step], reward[world, step] = act, paid
+    after = {"events": tokens, "extrinsic_reward": reward, "done": done}
+    if hazard is not None:
+        after["hazard"] = hazard
+    return TensorDict({"action": action, "next": after}, [count, T])
+
+
+CHAIN = [(3, KEY, DO, 0.0), (9, DOOR, DO, 0.0), (15, GOAL, MOVE, 1.0)]
+KEY_ONLY = [(12, KEY, DO, 0.0)]
+LATE_NOISE = [(16, NOISE, MOVE, 0.0)]
+
+
+def test_the_chain_is_found_backwards_from_what_pays():
+    selection = make_selection(deeds=False)
+    selection.observe(episodes(*[CHAIN] * 6, *[KEY_ONLY] * 10, *[LATE_NOISE] * 10, *[[]] * 10))
+    chosen = selection.update(0)
+    assert chosen.slots == {GOAL: 1, DOOR: 2, KEY: 3}
+    assert chosen.once == [1, 2, 3]
+
+
+def test_what_happens_again_in_many_episodes_is_not_attained_once():
+    selection = make_selection()
+    selection.observe(episodes(*[[(3, GOAL, MOVE, 1.0), (8, GOAL, MOVE, 1.0)]] * 3, [(5, GOAL, MOVE, 1.0)]))
+    assert selection.update(0).once == []
+
+
+def test_what_costs_is_no_subgoal():
+    hazard = torch.zeros(6, T, 1, dtype=torch.bool)
+    hazard[:, 4] = True
+    selection = make_selection()
+    selection.observe(episodes(*[[(4, DOOR, DO, 1.0), (8, KEY, DO, -0.5)]] * 6, hazard=hazard))
+    assert selection.update(0).slots == {}
+
+
+def test_deeds_fill_what_is_left_and_make_place_for_what_pays():
+    selection = make_selection(max_subgoals=2)
+    selection.observe(episodes(*[KEY_ONLY] * 5, *[[(7, DOOR, DO, 0.0)]] * 4, *[LATE_NOISE] * 9))
+    assert selection.update(0).slots == {KEY: 1, DOOR: 2}
+    selection.observe(episodes(*[[(15, GOAL, MOVE, 1.0)]] * 4))
+    assert selection.update(0).slots == {KEY: 1, GOAL: 2}
+
+
+def test_a_token_that_comes_with_a_nearer_one_is_no_event_of_its_own():
+    selection = make_selection()
+    step = [(5, KEY, DO, 0.0), (5, SHADE, DO, 0.0)]
+    selection.observe(episodes(*[step] * 9, [(6, SHADE, DO, 0.0)]))
+    history = selection._history()
+    assert events_of(history, selection.detector.precedence(), least=3) == [KEY]
+    assert events_of(history, selection.detector.precedence(), least=3, absorbed=0.95) == [KEY, SHADE]
+    assert events_of(history, selection.detector.precedence(), least=10) == [SHADE]
+
+
+def test_evidence_is_the_likelihood_ratio_against_chance():
+    """Two of four episodes of 20 steps have DOOR, both after KEY, which is past in 16 + 16 of 80 steps."""
+    selection = make_selection()
+    selection.observe(episodes(CHAIN, CHAIN, [], []))
+    found = Occurrences(selection._history(), [KEY, DOOR])
+    evidence, share = found.evidence(1, [])
+    assert share.tolist() == [1.0, 0.0]
+    assert evidence[0].item() == pytest.approx(2 * math.log((4 * T + 1) / (2 * 16 + 1)))
+    given, _ = found.evidence(1, [0])
+    assert given[0].item() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_episodes_go_on_from_batch_to_batch():
+    selection = make_selection()
+    batch = episodes(CHAIN, [])
+    batch["next", "done"][0, :, :] = False
+    batch["next", "done"][0, 8] = True
+    selection.observe(batch)
+    selection.observe(batch)
+    history = selection._history()
+    assert isinstance(history, History)
+    assert history.lengths.tolist() == [9, 20, 11, 20, 20]
+    assert list(zip(history.episode.tolist(), history.step.tolist(), strict=True)) == [
+        (0, 3), (1, 0), (1, 6), (1, 14), (2, 0), (2, 6)
+    ]  # fmt: skip
+
+
+def test_a_resumed_selection_goes_on_as_it_was():
+    first, second = make_selection(), make_selection()
+    first.observe(episodes(*[CHAIN] * 6, *[[]] * 10))
+    first.update(0)
+    second.load_state_dict(first.state_dict())
+    for selection in (first, second):
+        selection.observe(episodes(*[LATE_NOISE] * 3, *[KEY_ONLY] * 13))
+    assert first.update(1) == second.update(1)
+    assert first.reasons == second.reasons
+
+
+def pursuit(active, attained, subgoals=3):
+    count = len(active)
+    active, attained = torch.tensor(active), torch.nn.functional.one_hot(torch.tensor(attained), subgoals).bool()
+    attained[..., 0] = False
+    mask = torch.ones(count, subgoals, dtype=torch.bool)
+    return TensorDict({"subgoal_mask": mask, "next": {"active_subgoal": active, "attained": attained}}, [count])
+
+
+def test_a_subgoal_fails_if_its_pursuit_does_not_bring_it_about_in_three_trials():
+    control = Control(3, trial_steps=4)
+    batch = pursuit([1, 1, 1, 1, 2, 2, 2, 2], [0, 0, 0, 1, 2, 2, 0, 1])
+    for trial in range(3):
+        assert not control.failed.any(), trial
+        control.observe(batch)
+    assert control.failed.tolist() == [False, True, False]
+    control.reset(1)
+    assert not control.failed.any()
+
+
+def test_what_fails_gives_its_slot_away_and_does_not_come_back():
+    selection = make_selection(max_subgoals=1)
+    selection.observe(episodes(*[KEY_ONLY] * 5, *[[(7, DOOR, DO, 0.0)]] * 4))
+    assert selection.update(0).slots == {KEY: 1}
+    selection.control.failed[1] = True
+    assert selection.update(0).slots == {DOOR: 1}
