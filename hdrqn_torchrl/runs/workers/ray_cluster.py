@@ -21,6 +21,7 @@ _OWN_CLUSTER = {
     _OWN_NODE: "0",  # else Ray takes another address of this machine instead of the loopback one
     "RAY_AUTH_MODE": "disabled",  # else it writes a token to the home folder
     "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_worker_niceness": "0",  # else 15: a first process that learns would starve them
     "RAY_kill_child_processes_on_worker_exit": "0",  # they end by themselves, the one that cleans up last
 }
 _PATIENCE_SECONDS = 10.0
