@@ -34,7 +34,7 @@ def needs(*modules):
     [pytest.param(MINIGRID, marks=needs("minigrid")), pytest.param(MONTEZUMA, marks=needs("ale_py"))],
     ids=["minigrid", "montezuma"],
 )
-def test_it_trains_to_its_end_and_goes_on_exactly_where_it_was(tmp_path, settings, kind):
+def test_it_trains_to_its_end_and_goes_on_where_it_was(tmp_path, settings, kind):
     def train(*more):
         command = [sys.executable, str(ROOT / "train.py"), *settings, f"collector={kind}", *SHORT, *more]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
