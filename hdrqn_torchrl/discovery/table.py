@@ -95,13 +95,19 @@ class SubgoalTable(nn.Module):
         return kept
 
     def attained(self, tokens: Tensor) -> Tensor:
-        """Which subgoals steps with these tokens ``[*, K]`` attained, ``[*, G]`` bool."""
+        """Which subgoal a step attained, ``[*, G]`` bool: that of the first of its tokens that has one, or none.
+
+        Tokens come in the order of how well they can be told, rewards last. So a reward that another subgoal explains
+        is not attained besides.
+
+        Args:
+            tokens: ``[*, K]``.
+        """
         place = torch.searchsorted(self.tokens, tokens).clamp(max=len(self.tokens) - 1)
         slot = torch.where(self.tokens[place] == tokens, self.slots[place], EXPLORE)  # [*, K]
-        attained = torch.zeros((*tokens.shape[:-1], self.num_subgoals), dtype=torch.bool, device=tokens.device)
-        attained.scatter_(-1, slot, True)
-        attained[..., EXPLORE] = False
-        return attained
+        first = (slot != EXPLORE).long().argmax(-1, keepdim=True)
+        subgoals = torch.arange(self.num_subgoals, device=tokens.device)
+        return (slot.gather(-1, first) == subgoals) & (subgoals != EXPLORE)
 
     def available(self, spent: Tensor) -> Tensor:
         """Which subgoals can be chosen, ``[*, G]`` bool; "explore" where there is no other.

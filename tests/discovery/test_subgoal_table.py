@@ -13,9 +13,9 @@ def table():
     return table
 
 
-def test_a_step_attains_the_subgoals_of_its_tokens(table):
-    tokens = torch.tensor([[0, 0], [2, 0], [9, 5], [7, 10**12]])
-    assert table.attained(tokens).long().tolist() == [[0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 0]]
+def test_a_step_attains_the_subgoal_of_the_first_of_its_tokens_that_has_one(table):
+    tokens = torch.tensor([[0, 0], [2, 0], [9, 5], [7, 5], [7, 10**12]])
+    assert table.attained(tokens).long().tolist() == [[0, 0, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 0]]
     assert not SubgoalTable(2).attained(tokens).any()
 
 
