@@ -180,8 +180,8 @@ class EventSelection:
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed training needs."""
         return {
-            "rows": list(self._rows),
-            "ends": list(self._ends),
+            "rows": torch.cat(self._rows) if self._rows else None,  # one tensor, where batches had thousands
+            "ends": torch.cat(self._ends) if self._ends else None,
             "clock": self._clock,
             "since": self._since,
             "slots": dict(self.slots),
@@ -192,7 +192,7 @@ class EventSelection:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
-        self._rows, self._ends = list(state["rows"]), list(state["ends"])
+        self._rows, self._ends = ([] if state[name] is None else [state[name].cpu()] for name in ("rows", "ends"))
         self._clock, self._since = state["clock"], state["since"]
         self.slots, self.reasons = dict(state["slots"]), dict(state["reasons"])
         self._dropped = list(state["dropped"])
