@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from functools import cache, partial
 
 import pytest
@@ -59,9 +59,16 @@ def test_arguments(name):
     stated = {key: value for key, value in composed(name).items() if key != "_target_"}
     assert set(defaults) - PYTHON_ONLY == set(stated)
     built = LEARNERS | {key for key in stated if key.endswith("exploration")}  # compared below
-    assert {key: defaults[key] for key in stated if key not in built} == {
-        key: stated[key] for key in stated if key not in built
+    assert {key: as_numbers(defaults[key]) for key in stated if key not in built} == {
+        key: as_numbers(stated[key]) for key in stated if key not in built
     }
+
+
+def as_numbers(value):
+    """Settings as numbers and words, from Python or from ``conf/``."""
+    if is_dataclass(value):
+        return asdict(value)
+    return {key: each for key, each in value.items() if key != "_target_"} if isinstance(value, dict) else value
 
 
 @algorithms
