@@ -96,27 +96,39 @@ def test_a_cluster_that_has_gone_ends_the_collection_and_the_state_can_be_saved(
     assert collector.state_dict()["workers"] == [None, None]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("killed", ["gcs_server", "raylet/raylet"])
-def test_a_training_whose_cluster_goes_saves_all_that_was_learned(tmp_path, killed):
+def training_whose_cluster_goes(folder, killed):
+    """What a training tells when a process of its cluster is killed, and the frames of its newest checkpoint."""
     long = ["collector=ray", "hydra.run.dir=run", "total_frames=40000", "evaluation.ceilings=false"]
+    long += ["checkpoint.interval_frames=1000"]
     command = [sys.executable, str(ROOT / "train.py"), "algo=hdqn", "logger=csv", *TINY, *TINY_HDRQN, *long]
-    with (tmp_path / "told.txt").open("w") as told:
-        process = subprocess.Popen(command, cwd=tmp_path, stderr=told)
-    metrics = tmp_path / "run/metrics.csv"
+    with (folder / "told.txt").open("w") as told:
+        process = subprocess.Popen(command, cwd=folder, stderr=told)
+    metrics = folder / "run/metrics.csv"
     try:
-        wait_until(lambda: process.poll() is not None or (metrics.exists() and "\n1" in metrics.read_text()), 600)
+        wait_until(lambda: process.poll() is not None or (metrics.exists() and "\n2" in metrics.read_text()), 600)
         os.kill(descendant(process.pid, killed), signal.SIGKILL)
         assert process.wait(120) == 1
     finally:
         process.kill()
-    told = (tmp_path / "told.txt").read_text()
+    newest = max(int(path.name.rpartition("-")[2]) for path in folder.glob("run/checkpoints/checkpoint-*"))
+    return (folder / "told.txt").read_text(), newest
+
+
+@pytest.mark.slow
+def test_a_training_whose_cluster_goes_saves_all_that_was_learned(tmp_path):
+    told, newest = training_whose_cluster_goes(tmp_path, "gcs_server")
     assert "must answer until the end, got nothing from 127.0.0.1:" in told
-    assert "; start it again (after frame 1" in told
+    assert "; start it again (after frame 2" in told
     assert "when that is fixed, `" in told and f"train.py resume={tmp_path}/run` goes on" in told
-    newest = max(int(path.name.rpartition("-")[2]) for path in tmp_path.glob("run/checkpoints/checkpoint-*"))
-    logged = int(metrics.read_text().splitlines()[-1].partition(",")[0])
+    logged = int((tmp_path / "run/metrics.csv").read_text().splitlines()[-1].partition(",")[0])
     assert 0 <= newest - logged < 500  # a row comes every 500 frames
+
+
+@pytest.mark.slow
+def test_ray_ends_a_training_whose_own_node_is_lost_which_keeps_its_last_checkpoint(tmp_path):
+    told, newest = training_whose_cluster_goes(tmp_path, "raylet/raylet")
+    assert "Raylet is terminated" in told
+    assert newest >= 1000
 
 
 def descendant(pid: int, program: str) -> int:
