@@ -52,7 +52,7 @@ class ByHand:
     def observe(self, batch) -> None:
         self.steps += batch.numel()
 
-    def update(self, frames: int) -> Chosen:
+    def update(self) -> Chosen:
         self.asked += 1
         return self.chosen[min(self.asked, len(self.chosen)) - 1]
 

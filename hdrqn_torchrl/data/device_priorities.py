@@ -11,8 +11,7 @@ from torch import Tensor
 from torchrl.data import Storage
 from torchrl.data.replay_buffers.samplers import Sampler
 
-from hdrqn_torchrl import keys
-from hdrqn_torchrl.data.prioritized import FLOOR, PriorityStarts, StartRule, check_priorities, places_of
+from hdrqn_torchrl.data.prioritized import FLOOR, StartRule, check_priorities, places_of
 from hdrqn_torchrl.data.slices import padded_slices
 
 _FINEST = 2**40  # parts of the largest weight
@@ -26,12 +25,12 @@ class DevicePrioritySampler(Sampler):
     with it. States are the same as the other's, and each can load the other's.
 
     Args:
-        capacity, slice_len, sampling, priority_exponent, importance_exponent, init_key, traj_key, done_key,
-            terminated_key: as there.
+        capacity, priority_exponent, importance_exponent: as there.
+        rule: which steps begin a sequence.
         device: of the storage.
 
     Examples:
-        >>> DevicePrioritySampler(10, slice_len=2).state_dict()["largest"]
+        >>> DevicePrioritySampler(10, StartRule(slice_len=2)).state_dict()["largest"]
         1.0
     """
 
@@ -40,30 +39,18 @@ class DevicePrioritySampler(Sampler):
     def __init__(
         self,
         capacity: int,
+        rule: StartRule,
         *,
-        slice_len: int,
-        sampling: PriorityStarts = "steps",
         priority_exponent: float = 0.9,
         importance_exponent: float = 0.6,
-        init_key: NestedKey = keys.IS_INIT,
-        traj_key: NestedKey = keys.TRAJ_IDS,
-        done_key: NestedKey = ("next", keys.DONE),
-        terminated_key: NestedKey | None = None,
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__()
-        self.slice_len, self._alpha, self._beta = slice_len, priority_exponent, importance_exponent
-        self._rule = StartRule(
-            slice_len=slice_len,
-            sampling=sampling,
-            init_key=init_key,
-            traj_key=traj_key,
-            done_key=done_key,
-            terminated_key=terminated_key,
-        )
+        self._rule, self._alpha, self._beta = rule, priority_exponent, importance_exponent
+        self.slice_len = rule.slice_len
         self._powers = torch.zeros(capacity, device=device)  # priority ** alpha; 0 where no complete sequence begins
         self._starts = torch.zeros(capacity, dtype=torch.bool, device=device)
-        self.left = torch.full((capacity,), slice_len, device=device)
+        self.left = torch.full((capacity,), rule.slice_len, device=device)
         """Real steps from each on, ``[capacity]``."""
         self._largest = torch.ones((), device=device)
         self._revision: int | None = None

@@ -28,11 +28,11 @@ class StartRule:
     """
 
     slice_len: int
-    sampling: PriorityStarts
-    init_key: NestedKey
-    traj_key: NestedKey
-    done_key: NestedKey
-    terminated_key: NestedKey | None
+    sampling: PriorityStarts = "steps"
+    init_key: NestedKey = keys.IS_INIT
+    traj_key: NestedKey = keys.TRAJ_IDS
+    done_key: NestedKey = ("next", keys.DONE)
+    terminated_key: NestedKey | None = None
 
     def find(self, storage: Storage) -> tuple[Tensor, Tensor]:
         """Whether each stored step begins a complete sequence, and how many of its steps are real, ``[rows, N]``."""

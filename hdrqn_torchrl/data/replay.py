@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, Literal
 
 import torch
@@ -13,7 +12,7 @@ from torchrl.data import TensorDictReplayBuffer
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data.device_priorities import DevicePrioritySampler
-from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler
+from hdrqn_torchrl.data.prioritized import PrioritizedSequenceSampler, StartRule
 from hdrqn_torchrl.data.samplers import (
     EpisodeSliceSampler,
     EpisodeStartSampler,
@@ -160,23 +159,26 @@ def make_sequence_buffer(
             "which picks an episode first."
         )
     else:
-        kind = PrioritizedSequenceSampler
-        if not on_host(torch.empty(0, device=device)):
-            kind = partial(DevicePrioritySampler, device=device)  # type: ignore[assignment]
-        sampler = kind(
-            storage.max_size,
-            slice_len=length,
-            sampling=sampling,
-            priority_exponent=priority_exponent,
-            importance_exponent=importance_exponent,
-            traj_key=traj_key,
-            done_key=done_key,
-            terminated_key=terminated_key,
+        rule = StartRule(
+            slice_len=length, sampling=sampling, traj_key=traj_key, done_key=done_key, terminated_key=terminated_key
         )
+        sampler = _make_prioritized(storage.max_size, rule, priority_exponent, importance_exponent, device)
     buffer = SequenceBuffer(storage=storage, sampler=sampler, batch_size=batch_size * length)
     known = episode_len is not None if sampling in FROM_STARTS else terminated_key is None and priority_exponent is None
     buffer.keeps_starts = num_envs is not None and known
     return buffer
+
+
+def _make_prioritized(
+    capacity: int, rule: StartRule, priority: float, importance: float, device: torch.device | str | None
+) -> PrioritizedSequenceSampler | DevicePrioritySampler:
+    if on_host(torch.empty(0, device=device)):
+        return PrioritizedSequenceSampler(
+            capacity, **vars(rule), priority_exponent=priority, importance_exponent=importance
+        )
+    return DevicePrioritySampler(
+        capacity, rule, priority_exponent=priority, importance_exponent=importance, device=device or "cpu"
+    )
 
 
 def _check_capacity(

@@ -11,52 +11,19 @@ and a place that is usually copied well, but not in this step, is an event: "at 
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from hdrqn_torchrl.discovery.copying import CopyCounts, fit_copies
+from hdrqn_torchrl.discovery.layout import Layout
 from hdrqn_torchrl.envs.observations import code_sizes, observation_kind
 from hdrqn_torchrl.modules.sizes import check_size
 
 _RELIABLE = 0.8  # share of steps in which a place has to be copied well
-
-
-class Layout(NamedTuple):
-    """How codes lie in an observation: ``places`` cells with the same ``planes`` of codes each; others follow.
-
-    Examples:
-        >>> Layout.of((5,) * 9), Layout.of((11, 6, 4) * 49 + (4,))
-        (Layout(places=9, planes=(5,)), Layout(places=49, planes=(11, 6, 4)))
-    """
-
-    places: int
-    planes: tuple[int, ...]
-
-    @classmethod
-    def of(cls, num_codes: Sequence[int]) -> Layout:
-        """The layout with the smallest number of planes in which most entries are in a cell."""
-        sizes = tuple(num_codes)
-        found = cls(0, ())
-        for planes in range(1, 9):
-            period = sizes[:planes]
-            places = 0
-            while period and sizes[places * planes : (places + 1) * planes] == period:
-                places += 1
-            if places >= 4 and places * planes > found.places * len(found.planes):
-                found = cls(places, period)
-        return found
-
-    @property
-    def width(self) -> int:
-        """Side of the square that the places fill; all in one row if they fill none."""
-        side = math.isqrt(self.places)
-        return side if side * side == self.places else max(1, self.places)
 
 
 class ChangeDetector(nn.Module):
@@ -155,11 +122,6 @@ class ChangeDetector(nn.Module):
         """Whether it has learned enough."""
         return bool(self.is_ready)
 
-    @property
-    def reward_token(self) -> int:
-        """The token of a step with a positive reward."""
-        return 1 + self.layout.places * sum(size * size for size in self.layout.planes)
-
     def observe(self, before: Tensor, action: Tensor, after: Tensor) -> None:
         """Learns from steps, until it is ready.
 
@@ -198,35 +160,23 @@ class ChangeDetector(nn.Module):
         if self.layout.places:
             self._put_changes(tokens, self._cells(before), action, self._cells(after))
         if reward is not None:
-            tokens[..., -1] = torch.where(reward.squeeze(-1) > 0, self.reward_token, 0)
+            tokens[..., -1] = torch.where(reward.squeeze(-1) > 0, self.layout.reward_token, 0)
         return tokens
 
     def precedence(self) -> Tensor:
         """Rank of each token, by number, in the order of its place and plane, rewards last; ``[tokens + 1]``."""
-        block = sum(size * size for size in self.layout.planes)
         plane = torch.arange(len(self.layout.planes)).repeat_interleave(self._sizes.cpu().square())
-        rank = self.order.cpu().argsort().unsqueeze(-1) * len(self.layout.planes) + plane  # [P, block]
-        last = self.layout.places * max(1, block)
+        rank = self.order.cpu().argsort().unsqueeze(-1) * len(self.layout.planes) + plane  # [P, tokens of a place]
+        last = self.layout.places * max(1, self.layout.tokens_of_place)
         return torch.cat([torch.tensor([last]), rank.flatten(), torch.tensor([last])])
 
     def at_agent(self, token: int) -> bool:
         """Whether a token's place is the agent's own: the one that movements leave as it is while all others shift."""
-        place = (token - 1) // max(1, sum(size * size for size in self.layout.planes))
-        return token != self.reward_token and bool(self.filled[:, place].any())
+        return token != self.layout.reward_token and bool(self.filled[:, self.layout.place_of(token)].any())
 
     def name(self, token: int) -> str:
         """An event in words."""
-        if token == self.reward_token:
-            return "reward"
-        if not 0 < token < self.reward_token:
-            raise ValueError(f"token must lie in [1, {self.reward_token}], got {token}.")
-        place, rest = divmod(token - 1, sum(size * size for size in self.layout.planes))
-        plane = 0
-        while rest >= self.layout.planes[plane] ** 2:
-            rest, plane = rest - self.layout.planes[plane] ** 2, plane + 1
-        was, now = divmod(rest, self.layout.planes[plane])
-        where = f"({place // self.layout.width}, {place % self.layout.width})"
-        return f"{where}{f' plane {plane}' if len(self.layout.planes) > 1 else ''}: {was} -> {now}"
+        return self.layout.name(token)
 
     def _cells(self, observation: Tensor) -> Tensor:
         """``[*, P, planes]`` int64."""

@@ -59,6 +59,7 @@ class EventSelection:
         self.control = Control(max_subgoals + 1)
         self._dropped: list[int] = []
         self._rows: list[Tensor] = []
+        self._kept = 0  # rows in all of these
         self._ends: list[Tensor] = []
         self._clock = 0
         self._since = 0
@@ -79,19 +80,16 @@ class EventSelection:
         rows = torch.cat([torch.stack([worlds, steps, acted.long(), micro], -1), tokens], -1)  # [N, T, 4 + K]
         told = (tokens > 0).any(-1) | (micro != 0)
         self._rows.append(rows[told].cpu())
+        self._kept += len(self._rows[-1])
         ends = after.get(keys.DONE).squeeze(-1)
         self._ends.append(torch.stack([worlds[ends], steps[ends]], -1).cpu())
         self._clock += action.shape[1]
         self.control.observe(batch)
-        if sum(map(len, self._rows)) > 2 * _ROWS:
+        if self._kept > 2 * _ROWS:
             self._forget()
 
-    def update(self, frames: int) -> Chosen:
-        """Looks for subgoals in all that happened so far.
-
-        Args:
-            frames: environment frames so far.
-        """
+    def update(self) -> Chosen:
+        """Looks for subgoals in all that happened so far."""
         self._drop()
         history = self._history()
         events = events_of(history, self.detector.precedence(), least=self.least)
@@ -176,6 +174,7 @@ class EventSelection:
         rows, ends = torch.cat(self._rows), torch.cat(self._ends)
         self._since = int(rows[:, 1].sort().values[-_ROWS])
         self._rows, self._ends = [rows[rows[:, 1] >= self._since]], [ends[ends[:, 1] >= self._since]]
+        self._kept = len(self._rows[0])
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed training needs."""
@@ -193,6 +192,7 @@ class EventSelection:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._rows, self._ends = ([] if state[name] is None else [state[name].cpu()] for name in ("rows", "ends"))
+        self._kept = sum(map(len, self._rows))
         self._clock, self._since = state["clock"], state["since"]
         self.slots, self.reasons = dict(state["slots"]), dict(state["reasons"])
         self._dropped = list(state["dropped"])

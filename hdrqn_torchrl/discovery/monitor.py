@@ -61,7 +61,7 @@ class Discovery:
                 learner.begin_empty()
 
     def _discover(self) -> None:
-        table, chosen = self.critic.table, self.selection.update(self.frames)
+        table, chosen = self.critic.table, self.selection.update()
         before = table.tokens.clone(), table.slots.clone(), table.once.clone()
         kept = table.assign(chosen.slots, once=chosen.once, frames=self.frames)
         if all(torch.equal(old, new) for old, new in zip(before, (table.tokens, table.slots, table.once), strict=True)):

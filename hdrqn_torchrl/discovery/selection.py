@@ -23,7 +23,7 @@ class Selection(Protocol):
     def observe(self, batch: TensorDictBase) -> None:
         """Takes in collected steps ``[N, T]`` with their events."""
 
-    def update(self, frames: int) -> Chosen:
+    def update(self) -> Chosen:
         """Looks for subgoals, at discovery points alone."""
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,27 +1,23 @@
-"""Results of episodes: sums per episode while training, and greedy evaluation on fixed seeds."""
+"""Greedy evaluation on fixed seeds."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs import Task, task_of
+from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.isolation import isolated
 
-_SUMMED = {
-    "return": keys.REWARD,
-    "extrinsic": keys.EXTRINSIC_REWARD,
-    "intrinsic": keys.INTRINSIC_REWARD,
-}
 _FIGURES = {
     "return_mean": "return",
     "extrinsic_mean": "extrinsic",
@@ -53,6 +49,7 @@ class PlaceCounter:
         cell: side of a cell of the map in pixels.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> places = PlaceCounter(8, 8, cell=4)
         >>> after = {"position": torch.tensor([[1.0, 2.0], [7.0, 3.0]])}
         >>> places.add_step(TensorDict({"next": after}, [2]))
@@ -71,99 +68,6 @@ class PlaceCounter:
         index = y.clamp(0, rows - 1) * columns + x.clamp(0, columns - 1)
         weight = torch.ones_like(index) if counted is None else counted.cpu().long()
         self.counts.view(-1).index_add_(0, index, weight)
-
-
-class EpisodeTracker:
-    """Sums what happens in each of N environments and reports the episodes that end.
-
-    Reported per episode: ``return``, ``steps`` and, as far as environment and agent have them, ``extrinsic``,
-    ``intrinsic``, ``success`` (1 if the whole task was completed) and ``in_order`` (share of subgoals reached in the
-    proper order, where the task has one).
-
-    Args:
-        task: says whether subgoals have an order, and which entry marks success.
-        per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
-            attained, options for it that ended, and those of them that reached it.
-    """
-
-    def __init__(self, task: Task = Task(), *, per_subgoal: bool = False) -> None:  # noqa: B008 (frozen)
-        self.task, self.per_subgoal = task, per_subgoal
-        self.sums: TensorDictBase | None = None  # [N]
-        self._in_order: Tensor | None = None  # [N] int64: subgoals attained so far, -1 once the order is broken
-
-    def add(self, after: TensorDictBase) -> TensorDictBase:
-        """Takes one step of all environments (what the environment wrote, ``[N]``).
-
-        Returns:
-            The sums ``[N]`` up to and including this step; those of ended episodes are cleared afterwards.
-        """
-        summed = {**_SUMMED, "success": self.task.success}
-        step = {name: after.get(key).squeeze(-1).float() for name, key in summed.items() if key in after}
-        if self.task.ordered and keys.ATTAINED in after:
-            step["in_order"] = self._next_in_order(after)
-        step["steps"] = torch.ones_like(step["return"])
-        if self.per_subgoal:
-            step |= _subgoal_events(after)
-        sums = TensorDict(step, after.batch_size, device=after.device)
-        if self.sums is not None:
-            sums = sums + self.sums
-        self.sums = sums.clone().masked_fill_(after.get(keys.DONE).squeeze(-1), 0.0)
-        return sums
-
-    def _next_in_order(self, after: TensorDictBase) -> Tensor:
-        """The share of all subgoals that a step attained in its turn, 0 or 1/G ``[N]``."""
-        attained, done = after.get(keys.ATTAINED), after.get(keys.DONE).squeeze(-1)
-        number = attained.shape[-1]
-        before = torch.zeros_like(done, dtype=torch.int64) if self._in_order is None else self._in_order
-        wanted = before.unsqueeze(-1) == torch.arange(number, device=attained.device)
-        is_next = (attained == wanted).all(-1) & wanted.any(-1)
-        now = torch.where(is_next, before + 1, torch.where(attained.any(-1), -1, before))
-        self._in_order = now.masked_fill(done, 0)
-        return is_next.float() / number
-
-    def finished(self, batch: TensorDictBase) -> TensorDictBase:
-        """Takes a collected batch ``[N, T]``; returns the episodes ``[M]`` that ended in it."""
-        sums, ended = self.follow(batch)
-        return sums[ended]
-
-    def follow(self, batch: TensorDictBase) -> tuple[TensorDictBase, Tensor]:
-        """Takes a collected batch ``[N, T]``; returns sums up to each step and whether it is the last, ``[T, N]``."""
-        self._forget(batch.get(keys.IS_INIT, None))
-        after = batch.get("next").transpose(0, 1)  # [T, N]
-        sums: TensorDictBase = torch.stack([self.add(step) for step in after.unbind(0)], 0)  # type: ignore[assignment]
-        return sums, after.get(keys.DONE).squeeze(-1)
-
-    def _forget(self, init: Tensor | None) -> None:
-        """Clears the sums of episodes that were lost between two batches: others begin in their rows ``[N, T, 1]``."""
-        if init is None or self.sums is None:
-            return
-        begins = init[:, 0].squeeze(-1)
-        self.sums = self.sums.masked_fill(begins, 0.0)
-        if self._in_order is not None:
-            self._in_order = self._in_order.masked_fill(begins, 0)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Sums of the episodes in progress."""
-        return {"sums": self.sums, "in_order": self._in_order}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores what :meth:`state_dict` returned; older states hold no order, which then begins anew."""
-        self.sums, self._in_order = state["sums"], state.get("in_order")
-
-
-def _subgoal_events(after: TensorDictBase) -> dict[str, Tensor]:
-    """What happened to each subgoal in one step, ``[N, G]`` each."""
-    if keys.ATTAINED not in after:
-        return {}
-    attained = after.get(keys.ATTAINED).float()
-    if keys.OPTION_DONE not in after:
-        return {"attained": attained}
-    active = torch.nn.functional.one_hot(after.get(keys.ACTIVE_SUBGOAL), attained.shape[-1]).float()
-    return {
-        "attained": attained,
-        "chosen": active * after.get(keys.OPTION_DONE),
-        "reached": active * after.get(keys.SUBGOAL_REACHED),
-    }
 
 
 @torch.no_grad()

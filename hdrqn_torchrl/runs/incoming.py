@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import Arriving, LateCheck, on_host
 from hdrqn_torchrl.learning.finite import check_batch
-from hdrqn_torchrl.runs.evaluation import EpisodeTracker
+from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 
 
 class Incoming:

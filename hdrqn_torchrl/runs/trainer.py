@@ -22,7 +22,7 @@ from hdrqn_torchrl.learning.finite import NonFiniteError, naming
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
 from hdrqn_torchrl.runs.components import components_of
-from hdrqn_torchrl.runs.evaluation import EpisodeTracker
+from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.incoming import Incoming
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger

@@ -6,7 +6,7 @@ from helpers import small_env
 from torchrl.data import Unbounded
 
 from hdrqn_torchrl.discovery import ChangeDetector, make_change_detector
-from hdrqn_torchrl.discovery.changes import Layout
+from hdrqn_torchrl.discovery.layout import Layout
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 
 
@@ -81,8 +81,8 @@ def test_the_last_token_says_that_a_step_was_rewarded():
     detector = ChangeDetector((), 2, num_tokens=2)
     before, action = torch.zeros(3, 4), torch.tensor([0, 1, 0])
     reward = torch.tensor([[0.0], [1.0], [-1.0]])
-    assert detector(before, action, before, reward).tolist() == [[0, 0], [0, detector.reward_token], [0, 0]]
-    assert detector.name(detector.reward_token) == "reward"
+    assert detector(before, action, before, reward).tolist() == [[0, 0], [0, detector.layout.reward_token], [0, 0]]
+    assert detector.name(detector.layout.reward_token) == "reward"
 
 
 def test_observations_without_codes_have_no_events_but_rewards_and_a_warning_says_so():

@@ -48,7 +48,7 @@ LATE_NOISE = [(16, NOISE, MOVE, 0.0)]
 def test_the_chain_is_found_backwards_from_what_pays():
     selection = make_selection(deeds=False)
     selection.observe(episodes(*[CHAIN] * 6, *[KEY_ONLY] * 10, *[LATE_NOISE] * 10, *[[]] * 10))
-    chosen = selection.update(0)
+    chosen = selection.update()
     assert chosen.slots == {GOAL: 1, DOOR: 2, KEY: 3}
     assert chosen.once == [1, 2, 3]
 
@@ -56,7 +56,7 @@ def test_the_chain_is_found_backwards_from_what_pays():
 def test_what_happens_again_in_many_episodes_is_not_attained_once():
     selection = make_selection()
     selection.observe(episodes(*[[(3, GOAL, MOVE, 1.0), (8, GOAL, MOVE, 1.0)]] * 3, [(5, GOAL, MOVE, 1.0)]))
-    assert selection.update(0).once == []
+    assert selection.update().once == []
 
 
 def test_what_costs_is_no_subgoal():
@@ -64,15 +64,15 @@ def test_what_costs_is_no_subgoal():
     hazard[:, 4] = True
     selection = make_selection()
     selection.observe(episodes(*[[(4, DOOR, DO, 1.0), (8, KEY, DO, -0.5)]] * 6, hazard=hazard))
-    assert selection.update(0).slots == {}
+    assert selection.update().slots == {}
 
 
 def test_deeds_fill_what_is_left_and_make_place_for_what_pays():
     selection = make_selection(max_subgoals=2)
     selection.observe(episodes(*[KEY_ONLY] * 5, *[[(7, DOOR, DO, 0.0)]] * 4, *[LATE_NOISE] * 9))
-    assert selection.update(0).slots == {KEY: 1, DOOR: 2}
+    assert selection.update().slots == {KEY: 1, DOOR: 2}
     selection.observe(episodes(*[[(15, GOAL, MOVE, 1.0)]] * 4))
-    assert selection.update(0).slots == {KEY: 1, GOAL: 2}
+    assert selection.update().slots == {KEY: 1, GOAL: 2}
 
 
 def test_a_token_that_comes_with_a_nearer_one_is_no_event_of_its_own():
@@ -115,11 +115,11 @@ def test_episodes_go_on_from_batch_to_batch():
 def test_a_resumed_selection_goes_on_as_it_was():
     first, second = make_selection(), make_selection()
     first.observe(episodes(*[CHAIN] * 6, *[[]] * 10))
-    first.update(0)
+    first.update()
     second.load_state_dict(first.state_dict())
     for selection in (first, second):
         selection.observe(episodes(*[LATE_NOISE] * 3, *[KEY_ONLY] * 13))
-    assert first.update(1) == second.update(1)
+    assert first.update() == second.update()
     assert first.reasons == second.reasons
 
 
@@ -145,6 +145,6 @@ def test_a_subgoal_fails_if_its_pursuit_does_not_bring_it_about_in_three_trials(
 def test_what_fails_gives_its_slot_away_and_does_not_come_back():
     selection = make_selection(max_subgoals=1)
     selection.observe(episodes(*[KEY_ONLY] * 5, *[[(7, DOOR, DO, 0.0)]] * 4))
-    assert selection.update(0).slots == {KEY: 1}
+    assert selection.update().slots == {KEY: 1}
     selection.control.failed[1] = True
-    assert selection.update(0).slots == {DOOR: 1}
+    assert selection.update().slots == {DOOR: 1}

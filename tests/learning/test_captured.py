@@ -63,17 +63,22 @@ def capturing(monkeypatch, as_on_gpu):
     monkeypatch.setattr(learner_module, "Captured", partial(Captured, recording=Tape, warm_ups=2))
 
 
+def assert_same_reports(captured, plain, *, updates):
+    """Both learn with the same random numbers; the second one calls what the first one has recorded."""
+    plain._captured = plain._gradient_step
+    results = []
+    for each in (captured, plain):
+        torch.manual_seed(5)
+        results.append(learn(each, updates))
+    assert results[0] == results[1]
+
+
 class TestCapturedUpdates:
     @pytest.mark.parametrize(("name", "levels"), EVERY, ids=IDS)
     def test_weights_and_reports_equal_those_of_updates_that_are_not_captured(self, name, levels, capturing):
         captured, plain = (make_learners(name, levels) for _ in "ab")
         for level, learner in captured.items():
-            plain[level]._captured = plain[level]._gradient_step
-            results = []
-            for each in (learner, plain[level]):
-                torch.manual_seed(5)
-                results.append(learn(each, 14))
-            assert results[0] == results[1]
+            assert_same_reports(learner, plain[level], updates=14)
             states = [each.loss.state_dict() for each in (learner, plain[level])]
             assert all(torch.equal(states[0][key], states[1][key]) for key in states[1] if key != "__batch_size")
             assert any(piece._results for piece in learner._captured._pieces.values())
@@ -83,12 +88,8 @@ class TestCapturedUpdates:
         make = partial(make_learners, "v2", 2, priority_exponent=0.9) if kind == "priorities" else with_hindsight
         captured, plain = (make() for _ in "ab")
         for level, learner in captured.items():
-            plain[level]._captured = plain[level]._gradient_step
-            results = []
-            for each in (learner, plain[level]):
-                torch.manual_seed(5)
-                results.append(learn(each, 8))
-            assert results[0] == results[1] and learner._drawn == []
+            assert_same_reports(learner, plain[level], updates=8)
+            assert learner._drawn == []
             states = [each.buffer.state_dict()["_sampler"] for each in (learner, plain[level])]
             if kind == "priorities":
                 assert all(torch.equal(*(state[name] for state in states)) for name in ("priorities", "starts"))

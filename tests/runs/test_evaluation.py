@@ -11,12 +11,12 @@ from torchrl.envs import ExplorationType, set_exploration_type
 from user_envs import Corridor
 
 from hdrqn_torchrl.analysis.episodes import summarise
-from hdrqn_torchrl.envs import Task, make_gym, task_of
+from hdrqn_torchrl.envs import Task, make_gym
 from hdrqn_torchrl.learning.legs import LegCounter
-from hdrqn_torchrl.runs.evaluation import EpisodeTracker, PlaceCounter, evaluate, play, seed_of_round
+from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
+from hdrqn_torchrl.runs.evaluation import PlaceCounter, evaluate, play, seed_of_round
 
 PAIR = ("####", "#  #", "####")  # agent and goal side by side
-TRACKED = ("return", "extrinsic", "intrinsic", "success", "in_order", "steps")
 
 
 def pair_env(num_envs, max_steps=3):
@@ -144,39 +144,6 @@ class TestEvaluate:
             level.exploration.epsilon.fill_(1.0)
         assert evaluate(env, policy, episodes=8) == greedy
         assert evaluate(env, policy, episodes=8, exploration_type=ExplorationType.RANDOM) != greedy
-
-
-class TestEpisodeTracker:
-    def test_sums_over_many_batches_equal_a_plain_loop(self):
-        torch.manual_seed(0)
-        env = small_env(5)
-        batches = collect(build("v2", env), env, 3, batches=20)
-        tracker, expected, open_sums = EpisodeTracker(task_of(env)), [], [dict.fromkeys(TRACKED, 0.0) for _ in range(5)]
-        for batch in batches:
-            ended = []
-            for t in range(3):
-                for n in range(5):
-                    step, sums = batch["next"][n, t], open_sums[n]
-                    sums["return"] += step["reward"].item()
-                    sums["extrinsic"] += step["extrinsic_reward"].item()
-                    sums["intrinsic"] += step["intrinsic_reward"].item()
-                    sums["success"] += step["success"].item()
-                    sums["in_order"] += (step["extrinsic_reward"].item() >= 1) / 2  # of two goals
-                    sums["steps"] += 1
-                    if step["done"]:
-                        ended.append(sums)
-                        open_sums[n] = dict.fromkeys(TRACKED, 0.0)
-            finished = tracker.finished(batch)
-            assert len(finished) == len(ended)
-            for row, sums in zip(finished, ended, strict=True):
-                assert {key: row[key].item() for key in TRACKED} == pytest.approx(sums)
-            expected += ended
-        assert len(expected) > 20 and any(sums["success"] for sums in expected)
-
-    def test_flat_agents_have_no_intrinsic_reward(self):
-        env = small_env(5)
-        finished = EpisodeTracker(task_of(env)).finished(collect(build("drqn", env), env, 10)[0])
-        assert set(finished.keys()) == set(TRACKED) - {"intrinsic"}
 
 
 class TestTasksOfOthers:

@@ -13,7 +13,7 @@ from hdrqn_torchrl.devices import LateCheck
 from hdrqn_torchrl.learning import learner as learner_module
 from hdrqn_torchrl.learning.captured import Captured
 from hdrqn_torchrl.learning.finite import NonFiniteError
-from hdrqn_torchrl.runs.evaluation import EpisodeTracker
+from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.incoming import Incoming
 
 ARRIVED = {"devices.py:truth", "runs/incoming.py:_arrived"}  # places that read what a GPU has copied to the host

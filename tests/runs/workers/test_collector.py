@@ -101,7 +101,7 @@ def test_a_worker_that_is_replaced_plays_other_episodes():
 
 
 def test_a_lost_episode_does_not_count_for_the_next_one():
-    from hdrqn_torchrl.runs.evaluation import EpisodeTracker
+    from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 
     algorithm, collector = stamped("v3", 2)
     tracker, found = EpisodeTracker(algorithm.task), []
