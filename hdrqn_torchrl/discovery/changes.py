@@ -113,9 +113,7 @@ class ChangeDetector(nn.Module):
         sizes = torch.tensor(self.layout.planes, dtype=torch.int64)
         self.register_buffer("_sizes", sizes, persistent=False)
         self.register_buffer("_first_codes", sizes.cumsum(0) - sizes, persistent=False)
-        squares = sizes.square()
-        first = torch.arange(places).unsqueeze(-1) * squares.sum() + squares.cumsum(0) - squares
-        self.register_buffer("_first_tokens", first + 1, persistent=False)  # [P, planes]
+        self.register_buffer("_first_tokens", self.layout.first_tokens(), persistent=False)
 
     @property
     def ready(self) -> bool:
@@ -180,9 +178,7 @@ class ChangeDetector(nn.Module):
 
     def _cells(self, observation: Tensor) -> Tensor:
         """``[*, P, planes]`` int64."""
-        flat = observation.flatten(-self.num_dims).long() if self.num_dims else observation.unsqueeze(-1).long()
-        used = flat[..., : self.layout.places * len(self.layout.planes)]
-        return used.unflatten(-1, (self.layout.places, len(self.layout.planes)))
+        return self.layout.cells(observation, self.num_dims)
 
     def _contents(self, cells: Tensor) -> Tensor:
         """One number for all planes of a cell, ``[*, P]``."""
@@ -258,10 +254,7 @@ def make_change_detector(
         num_actions: A.
         num_tokens, warmup_frames: see :class:`ChangeDetector`.
     """
-    shape = observation.shape[1:]
-    sizes: tuple[int, ...] = ()
-    if observation_kind(observation, shape) in ("cells", "codes"):
-        sizes = code_sizes(observation, shape)
+    shape, sizes = observation.shape[1:], sizes_of(observation)
     if not Layout.of(sizes).places:
         warnings.warn(
             f"observations of shape {list(shape)} are no cells of codes, so that changes can't be told from movements; "
@@ -269,3 +262,9 @@ def make_change_detector(
             stacklevel=2,
         )
     return ChangeDetector(sizes, num_actions, num_dims=len(shape), num_tokens=num_tokens, warmup_frames=warmup_frames)
+
+
+def sizes_of(observation: TensorSpec) -> tuple[int, ...]:
+    """Number of codes of each entry of an observation ``[N, ...]``; empty if it has none."""
+    shape = observation.shape[1:]
+    return code_sizes(observation, shape) if observation_kind(observation, shape) in ("cells", "codes") else ()

@@ -13,14 +13,13 @@ from torch import Tensor
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.discovery.changes import ChangeDetector
 from hdrqn_torchrl.discovery.control import Control
-from hdrqn_torchrl.discovery.history import History, Occurrences, events_of
+from hdrqn_torchrl.discovery.history import History, Occurrences, events_of, slots_attained_once
+from hdrqn_torchrl.discovery.record import EventRecord
 from hdrqn_torchrl.discovery.selection import Chosen
 from hdrqn_torchrl.modules.sizes import check_size
 
 PAYS, LEADS, DEED = 1, 2, 3
 """Why an event is a subgoal: it pays; it comes before one that does; it is something that an action does."""
-_ROWS = 200_000  # that are kept at most, of steps with an event
-_MICRO = 1_000_000
 _SHARE = 0.03  # of rewarded steps that an event that pays has to have
 
 
@@ -58,49 +57,24 @@ class EventSelection:
         """Why each token is a subgoal."""
         self.control = Control(max_subgoals + 1)
         self._dropped: list[int] = []
-        self._rows: list[Tensor] = []
-        self._kept = 0  # rows in all of these
-        self._ends: list[Tensor] = []
-        self._clock = 0
-        self._since = 0
+        self._record = EventRecord(detector.num_tokens)
 
     def observe(self, batch: TensorDictBase) -> None:
         """Takes in collected steps ``[N, T]``, with the events of each."""
-        after, action = batch.get("next"), batch.get(keys.ACTION)
-        tokens, reward = after.get(keys.EVENTS), after.get(keys.EXTRINSIC_REWARD).squeeze(-1)
-        micro = (reward.double() * _MICRO).round().long()
-        if (hazard := after.get(keys.HAZARD, None)) is not None:
-            micro = torch.where(hazard.squeeze(-1), -_MICRO, micro)
-        acted = ~self.detector.moves[action]
-        worlds, steps = torch.meshgrid(
-            torch.arange(action.shape[0], device=action.device),
-            self._clock + torch.arange(action.shape[1], device=action.device),
-            indexing="ij",
-        )
-        rows = torch.cat([torch.stack([worlds, steps, acted.long(), micro], -1), tokens], -1)  # [N, T, 4 + K]
-        told = (tokens > 0).any(-1) | (micro != 0)
-        self._rows.append(rows[told].cpu())
-        self._kept += len(self._rows[-1])
-        ends = after.get(keys.DONE).squeeze(-1)
-        self._ends.append(torch.stack([worlds[ends], steps[ends]], -1).cpu())
-        self._clock += action.shape[1]
+        self._record.add(batch, acted=~self.detector.moves[batch.get(keys.ACTION)])
         self.control.observe(batch)
-        if self._kept > 2 * _ROWS:
-            self._forget()
 
     def update(self) -> Chosen:
         """Looks for subgoals in all that happened so far."""
         self._drop()
-        history = self._history()
+        history = self._record.history()
         events = events_of(history, self.detector.precedence(), least=self.least)
         found = Occurrences(history, events)
         allowed = [token not in self._dropped for token in events]
         for index, reason in self._wanted(found, history):
             if allowed[index]:
                 self._keep(events[index], reason)
-        seldom = found.repeated * 20 < found.happened
-        once = {token for token, is_once in zip(events, seldom.tolist(), strict=True) if is_once}
-        return Chosen(slots=dict(self.slots), once=sorted(slot for token, slot in self.slots.items() if token in once))
+        return Chosen(slots=dict(self.slots), once=slots_attained_once(self.slots, found))
 
     def _wanted(self, found: Occurrences, history: History) -> list[tuple[int, int]]:
         """Events that could be subgoals, and why, the most important first."""
@@ -147,42 +121,10 @@ class EventSelection:
                 self._dropped.append(token)
                 self._free(token)
 
-    def _history(self) -> History:
-        """Steps by episode."""
-        rows = torch.cat(self._rows) if self._rows else torch.zeros((0, 4 + self.detector.num_tokens)).long()
-        ends = torch.cat(self._ends) if self._ends else torch.zeros((0, 2)).long()
-        worlds = 1 + int(max(rows[:, 0].max() if len(rows) else 0, ends[:, 0].max() if len(ends) else 0))
-        span = self._clock + 1
-        last = torch.arange(worlds) * span + self._clock - 1  # of episodes that have not ended
-        ended = torch.cat([ends[:, 0] * span + ends[:, 1], last]).unique()  # sorted
-        begin = torch.cat([torch.tensor([-1]), ended[:-1]]) + 1
-        begin = torch.where(begin % span == self._clock, begin // span * span + span, begin)  # the next world
-        begin = torch.maximum(begin, begin // span * span + self._since)
-        place = rows[:, 0] * span + rows[:, 1]
-        episode = torch.searchsorted(ended, place)
-        return History(
-            tokens=rows[:, 4:],
-            episode=episode,
-            step=place - begin[episode],
-            acted=rows[:, 2] > 0,
-            reward=rows[:, 3],
-            lengths=ended - begin + 1,
-        )
-
-    def _forget(self) -> None:
-        """Forgets the oldest steps."""
-        rows, ends = torch.cat(self._rows), torch.cat(self._ends)
-        self._since = int(rows[:, 1].sort().values[-_ROWS])
-        self._rows, self._ends = [rows[rows[:, 1] >= self._since]], [ends[ends[:, 1] >= self._since]]
-        self._kept = len(self._rows[0])
-
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed training needs."""
         return {
-            "rows": torch.cat(self._rows) if self._rows else None,  # one tensor, where batches had thousands
-            "ends": torch.cat(self._ends) if self._ends else None,
-            "clock": self._clock,
-            "since": self._since,
+            **self._record.state_dict(),
             "slots": dict(self.slots),
             "reasons": dict(self.reasons),
             "dropped": list(self._dropped),
@@ -191,9 +133,7 @@ class EventSelection:
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
-        self._rows, self._ends = ([] if state[name] is None else [state[name].cpu()] for name in ("rows", "ends"))
-        self._kept = sum(map(len, self._rows))
-        self._clock, self._since = state["clock"], state["since"]
+        self._record.load_state_dict(state)
         self.slots, self.reasons = dict(state["slots"]), dict(state["reasons"])
         self._dropped = list(state["dropped"])
         self.control.load_state_dict(state["control"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
@@ -106,6 +107,18 @@ class Occurrences:
         times = counted.sum()
         share = (self.first[counted] < then[counted].unsqueeze(-1)).sum(0).double() / times.clamp(min=1)
         return times * _divergence(share, chance) * (share > chance), share
+
+
+def slots_attained_once(slots: Mapping[int, int], found: Occurrences) -> list[int]:
+    """Slots of events that come a second time in fewer than 1 in 20 of their episodes, in ascending order.
+
+    Args:
+        slots: by token.
+        found: events, those with a slot among them.
+    """
+    seldom = (found.repeated * 20 < found.happened).tolist()
+    once = {token for token, is_once in zip(found.events, seldom, strict=True) if is_once}
+    return sorted(slot for token, slot in slots.items() if token in once)
 
 
 def _divergence(share: Tensor, chance: Tensor) -> Tensor:

@@ -6,6 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
+from torch import Tensor
+
 
 class Layout(NamedTuple):
     """How codes lie in an observation: ``places`` cells with the same ``planes`` of codes each; others follow.
@@ -50,6 +53,22 @@ class Layout(NamedTuple):
     def reward_token(self) -> int:
         """The token of a step with a positive reward."""
         return 1 + self.places * self.tokens_of_place
+
+    def cells(self, observation: Tensor, num_dims: int) -> Tensor:
+        """The codes of all places, ``[*, P, planes]`` int64.
+
+        Args:
+            observation: ``[*, ...]``, with ``num_dims`` dimensions of its own.
+            num_dims: how many.
+        """
+        flat = observation.flatten(-num_dims).long() if num_dims else observation.unsqueeze(-1).long()
+        used = flat[..., : self.places * len(self.planes)]
+        return used.unflatten(-1, (self.places, len(self.planes)))
+
+    def first_tokens(self) -> Tensor:
+        """The token of "0 -> 0" in each plane of each place, ``[P, planes]``; "a -> b" is ``a * codes + b`` further."""
+        squares = torch.tensor(self.planes, dtype=torch.int64).square()
+        return 1 + torch.arange(self.places).unsqueeze(-1) * squares.sum() + squares.cumsum(0) - squares
 
     def place_of(self, token: int) -> int:
         """Where a change is."""

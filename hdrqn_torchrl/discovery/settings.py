@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 from torchrl.data import TensorSpec
 
-from hdrqn_torchrl.discovery.changes import make_change_detector
+from hdrqn_torchrl.discovery.changes import make_change_detector, sizes_of
 from hdrqn_torchrl.discovery.critic import EventCritic
 from hdrqn_torchrl.discovery.events import EventSelection
+from hdrqn_torchrl.discovery.random_choice import RandomChanges, RandomSelection
 from hdrqn_torchrl.discovery.selection import Selection
 from hdrqn_torchrl.discovery.table import SubgoalTable
 from hdrqn_torchrl.modules.sizes import check_size
+
+Choice = Literal["useful", "random_events", "random_changes"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +28,9 @@ class DiscoverySettings:
             stored meanwhile is forgotten, as its events are unknown.
         discovery_frames: frames between two looks for subgoals.
         until_frames: frames after which the set stays as it is.
+        choice: ``"useful"``: events that matter. For controls: ``"random_events"``, drawn among all events, and
+            ``"random_changes"``, drawn among all changes of what is seen, even those that movements explain.
+        random_subgoals: number of subgoals that are drawn; ``None``: ``max_subgoals``.
 
     Raises:
         ValueError: if a value breaks its rule.
@@ -33,11 +40,21 @@ class DiscoverySettings:
     warmup_frames: int = 10_000
     discovery_frames: int = 20_000
     until_frames: int = 400_000
+    choice: Choice = "useful"
+    random_subgoals: int | None = None
 
     def __post_init__(self) -> None:
         for name, usual in (("max_subgoals", 8), ("warmup_frames", 10_000), ("discovery_frames", 20_000)):
             check_size(name, getattr(self, name), usual)
         check_size("until_frames", self.until_frames, 400_000)
+        if self.choice not in (known := get_args(Choice)):
+            raise ValueError(f"choice must be one of {', '.join(known)}, got {self.choice!r}; 'useful' is no control.")
+        number = self.random_subgoals
+        if number is not None and (self.choice == "useful" or not 1 <= number <= self.max_subgoals):
+            raise ValueError(
+                f"random_subgoals must be None, or with choice=random_events or random_changes lie in "
+                f"[1, {self.max_subgoals}] (max_subgoals), got {number} with choice={self.choice}."
+            )
 
     def make(self, observation: TensorSpec, num_actions: int) -> tuple[EventCritic, Selection]:
         """What tells events apart, and what chooses those that are subgoals.
@@ -48,7 +65,16 @@ class DiscoverySettings:
 
         Returns:
             The critic, and the selection that reads its events.
+
+        Raises:
+            ValueError: if ``choice`` is ``"random_changes"`` and the observation has no cells of codes.
         """
+        table, number = SubgoalTable(self.max_subgoals), self.random_subgoals or self.max_subgoals
+        if self.choice == "random_changes":
+            dims, sizes = len(observation.shape) - 1, sizes_of(observation)
+            changes = RandomChanges(sizes, number=number, num_dims=dims, warmup_frames=self.warmup_frames)
+            return EventCritic(changes, table), RandomSelection(number, number=number)
         detector = make_change_detector(observation, num_actions, warmup_frames=self.warmup_frames)
-        selection = EventSelection(detector, max_subgoals=self.max_subgoals)
-        return EventCritic(detector, SubgoalTable(self.max_subgoals)), selection
+        if self.choice == "random_events":
+            return EventCritic(detector, table), RandomSelection(detector.num_tokens, number=number)
+        return EventCritic(detector, table), EventSelection(detector, max_subgoals=self.max_subgoals)

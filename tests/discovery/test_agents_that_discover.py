@@ -38,9 +38,9 @@ def trained(agent, env, batches=10):
     return agent, batch
 
 
-def bare_env():
+def bare_env(num_envs=4, **settings):
     """The small room without anything that the agent must not read, and which states no subgoals."""
-    base = small_env()
+    base = small_env(num_envs, **settings)
     base.task = replace(base.task, subgoals=(), ordered=False)
     return TransformedEnv(base, ExcludeTransform(*PRIVILEGED))
 

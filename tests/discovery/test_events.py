@@ -79,7 +79,7 @@ def test_a_token_that_comes_with_a_nearer_one_is_no_event_of_its_own():
     selection = make_selection()
     step = [(5, KEY, DO, 0.0), (5, SHADE, DO, 0.0)]
     selection.observe(episodes(*[step] * 9, [(6, SHADE, DO, 0.0)]))
-    history = selection._history()
+    history = selection._record.history()
     assert events_of(history, selection.detector.precedence(), least=3) == [KEY]
     assert events_of(history, selection.detector.precedence(), least=3, absorbed=0.95) == [KEY, SHADE]
     assert events_of(history, selection.detector.precedence(), least=10) == [SHADE]
@@ -89,7 +89,7 @@ def test_evidence_is_the_likelihood_ratio_against_chance():
     """Two of four episodes of 20 steps have DOOR, both after KEY, which is past in 16 + 16 of 80 steps."""
     selection = make_selection()
     selection.observe(episodes(CHAIN, CHAIN, [], []))
-    found = Occurrences(selection._history(), [KEY, DOOR])
+    found = Occurrences(selection._record.history(), [KEY, DOOR])
     evidence, share = found.evidence(1, [])
     assert share.tolist() == [1.0, 0.0]
     assert evidence[0].item() == pytest.approx(2 * math.log((4 * T + 1) / (2 * 16 + 1)))
@@ -104,7 +104,7 @@ def test_episodes_go_on_from_batch_to_batch():
     batch["next", "done"][0, 8] = True
     selection.observe(batch)
     selection.observe(batch)
-    history = selection._history()
+    history = selection._record.history()
     assert isinstance(history, History)
     assert history.lengths.tolist() == [9, 20, 11, 20, 20]
     assert list(zip(history.episode.tolist(), history.step.tolist(), strict=True)) == [

@@ -1,7 +1,7 @@
 """A training that finds its subgoals, stopped and resumed, equals an uninterrupted one bit for bit."""
 
 import signal
-from functools import partial
+from functools import cache, partial
 
 import pytest
 from helpers import check_same, make_training, seed_everything, small_env
@@ -9,34 +9,49 @@ from helpers import check_same, make_training, seed_everything, small_env
 from hdrqn_torchrl.discovery import DiscoverySettings
 from hdrqn_torchrl.runs.interruption import Interrupted
 
-SETTINGS = DiscoverySettings(max_subgoals=3, warmup_frames=480, discovery_frames=160)
-TRAIN = partial(
-    make_training,
-    name="v3",
-    worlds=partial(small_env, num_obstacles=0),
-    learner={"capacity": 400, "slice_len": 7, "frames_per_update": 32},
-    options={"subgoals": "discovered", "discovery": SETTINGS},
-    total_frames=1_280,
-    log_frames=640,
-    evaluation_frames=640,
-)
+
+def training(folder, choice="useful", seed=0):
+    settings = DiscoverySettings(max_subgoals=3, warmup_frames=480, discovery_frames=160, choice=choice)
+    return make_training(
+        folder,
+        name="v3",
+        seed=seed,
+        worlds=partial(small_env, num_obstacles=0),
+        learner={"capacity": 400, "slice_len": 7, "frames_per_update": 32},
+        options={"subgoals": "discovered", "discovery": settings},
+        total_frames=1_280,
+        log_frames=640,
+        evaluation_frames=640,
+    )
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("training")
-    seed_everything(0)
-    trainer = TRAIN(folder)
-    trainer.train()
-    assert trainer.algorithm.monitors["discovery"].metrics()["discovery/subgoals"] >= 2
-    return folder
+    @cache
+    def uninterrupted(choice):
+        folder = tmp_path_factory.mktemp("training")
+        seed_everything(0)
+        trainer = training(folder, choice)
+        trainer.train()
+        assert trainer.algorithm.monitors["discovery"].metrics()["discovery/subgoals"] >= 2
+        return folder
+
+    return uninterrupted
+
+
+WHILE_IT_LEARNS, AT_THE_END, BEFORE, AFTER = 320, 480, 896, 1_088
+"""Frames while the detector learns, as it is ready, before there are subgoals and once there are."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("frames", [320, 480, 896, 1_088])  # while the detector learns, ..., once there are subgoals
-def test_a_stopped_and_resumed_training_finds_the_same_subgoals(frames, uninterrupted, tmp_path):
+@pytest.mark.parametrize(
+    ("choice", "frames"),
+    [("useful", frames) for frames in (WHILE_IT_LEARNS, AT_THE_END, BEFORE, AFTER)]
+    + [(choice, frames) for choice in ("random_events", "random_changes") for frames in (WHILE_IT_LEARNS, AFTER)],
+)
+def test_a_stopped_and_resumed_training_finds_the_same_subgoals(choice, frames, uninterrupted, tmp_path):
     seed_everything(0)
-    trainer = TRAIN(tmp_path)
+    trainer = training(tmp_path, choice)
     update = trainer.collector.update_policy_weights_
 
     def stopping():
@@ -48,8 +63,8 @@ def test_a_stopped_and_resumed_training_finds_the_same_subgoals(frames, uninterr
     with pytest.raises(Interrupted):
         trainer.train()
     seed_everything(99)
-    resumed = TRAIN(tmp_path, seed=99)
+    resumed = training(tmp_path, choice, seed=99)
     resumed.resume(resumed.checkpoints.newest())
     assert resumed.frames == frames
     resumed.train()
-    check_same(tmp_path, uninterrupted)
+    check_same(tmp_path, uninterrupted(choice))
