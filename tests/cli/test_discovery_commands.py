@@ -3,6 +3,8 @@
 import csv
 import json
 import sys
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -52,6 +54,13 @@ def test_its_subgoals_can_be_watched(folder, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     call(watch, monkeypatch, f"run={folder / 'run'}", "checkpoint=last", "out=sheet.png", "episodes=5", "epsilon=1.0")
     assert Image.open("sheet.png").height > 100
+
+
+def test_its_subgoals_are_scored_by_what_only_the_environment_knows(folder, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "benchmarks" / "discovery")
+    call(import_module("trained"), monkeypatch, f"run={folder / 'run'}", "frames=1_600", "epsilon=1.0", "num_envs=16")
+    scored = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert {each["subgoal"]: each["precision"] for each in scored["matches"]} == {"goal 1": 1.0, "goal 2": 1.0}
 
 
 def test_workers_are_refused(folder):
