@@ -7,6 +7,7 @@ runs      folders or glob patterns, in quotes, several in brackets; all runs at 
 out       what to write, by ending: .png .svg .pdf .csv; several in brackets
 kind      curves: the paper's four curves with greedy evaluations as points (default)
           greedy: greedy return, success, goals in order, steps; bars: final results
+          discovery: how many subgoals agents have found, return, success
 columns   any columns of metrics.csv instead, one panel each: columns=greedy/return,greedy/success,sub/loss; with
           kind=bars also how long it took: columns='wall_seconds until behaviour/return>=1.01', a mean only of groups
           whose runs all got there
@@ -24,7 +25,8 @@ log_x     true: logarithmic axis
 title     heading
 
 Runs of a group are aligned by linear interpolation and never extrapolated. A curve goes as far as half of them reach,
-and is dotted where not all do. Bands are pointwise: each holds at its position, not for the curve as a whole.
+and is dotted where not all do. Bands are pointwise: each holds at its position, not for the curve as a whole. Where
+agents find their subgoals themselves, triangles on the axis mark when.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
-from hdrqn_torchrl.analysis.comparison import FINALS, GREEDY, PAPER, Panel, plot_bars, plot_curves
+from hdrqn_torchrl.analysis.comparison import DISCOVERY, FINALS, GREEDY, PAPER, Panel, plot_bars, plot_curves
 from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
 from hdrqn_torchrl.analysis.grouping import Entry, Row, differences, rows_of, task_key, value_of
 from hdrqn_torchrl.analysis.results import (
@@ -52,7 +54,7 @@ from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 
 ALLOWED = {
-    "kind": ("curves", "greedy", "bars"),
+    "kind": ("curves", "greedy", "discovery", "bars"),
     "x": ("frames", "episodes", "updates", "wall_seconds"),
     "center": ("mean", "iqm"),
     "ceilings": ("known", "simulate", "none"),
@@ -117,7 +119,7 @@ def check(settings: Settings) -> None:
 def choose_panels(settings: Settings, entries: list[Entry]) -> list[Panel]:
     """What to draw, one panel each."""
     if not (columns := as_list(settings.columns, split=True)):
-        return list({"curves": PAPER, "greedy": GREEDY, "bars": FINALS}[settings.kind])
+        return list({"curves": PAPER, "greedy": GREEDY, "discovery": DISCOVERY, "bars": FINALS}[settings.kind])
     known = {name for entry in entries for name in entry.run.metrics}
     source = source_of if settings.kind == "bars" else str
     if unknown := [name for name in columns if source(name) not in known]:

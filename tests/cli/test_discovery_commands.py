@@ -11,7 +11,7 @@ from PIL import Image
 from processes import run_script
 from programs import TINY
 
-from hdrqn_torchrl.cli import evaluate, watch
+from hdrqn_torchrl.cli import evaluate, plot, watch
 from hdrqn_torchrl.cli.command_line import command_line
 
 ROOM = "env.layout=['#####','#   #','#   #','#   #','#####']"
@@ -54,6 +54,13 @@ def test_its_subgoals_can_be_watched(folder, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     call(watch, monkeypatch, f"run={folder / 'run'}", "checkpoint=last", "out=sheet.png", "episodes=5", "epsilon=1.0")
     assert Image.open("sheet.png").height > 100
+
+
+def test_a_figure_shows_when_they_were_found(folder, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    call(plot, monkeypatch, f"runs={folder / 'run'}", "out=[found.png,found.csv]", "kind=discovery")
+    assert "runs 1, groups 1" in capsys.readouterr().out and Image.open("found.png").height > 100
+    assert "discovery/subgoals" in Path("found.csv").read_text()
 
 
 def test_its_subgoals_are_scored_by_what_only_the_environment_knows(folder, monkeypatch, capsys):

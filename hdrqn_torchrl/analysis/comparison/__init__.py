@@ -2,6 +2,6 @@
 
 from hdrqn_torchrl.analysis.comparison.bars import plot_bars
 from hdrqn_torchrl.analysis.comparison.curves import plot_curves
-from hdrqn_torchrl.analysis.comparison.panels import FINALS, GREEDY, PAPER, Panel
+from hdrqn_torchrl.analysis.comparison.panels import DISCOVERY, FINALS, GREEDY, PAPER, Panel
 
-__all__ = ["FINALS", "GREEDY", "PAPER", "Panel", "plot_bars", "plot_curves"]
+__all__ = ["DISCOVERY", "FINALS", "GREEDY", "PAPER", "Panel", "plot_bars", "plot_curves"]

@@ -29,6 +29,7 @@ from hdrqn_torchrl.analysis.comparison.panels import (
     with_data,
     with_seeds,
 )
+from hdrqn_torchrl.analysis.discoveries import found_at
 from hdrqn_torchrl.analysis.estimates import Center, Estimate, Group, TaskResults
 
 _AXES = {
@@ -38,6 +39,8 @@ _AXES = {
     "wall_seconds": "wall time",
 }
 _UNITS = ((7200.0, 3600.0, "hours"), (180.0, 60.0, "minutes"), (0.0, 1.0, "seconds"))  # from, seconds, name
+
+_DISCOVERY: Any = {"linestyle": "", "marker": "^", "markersize": 5, "markeredgewidth": 0, "alpha": 0.5}
 
 
 def plot_curves(
@@ -52,7 +55,8 @@ def plot_curves(
 ) -> None:
     """Draws curves of groups of runs with confidence bands: a row for each task, a panel for each quantity.
 
-    A curve is solid as far as all runs of its group reach and dotted where only some do.
+    A curve is solid as far as all runs of its group reach and dotted where only some do. Where agents find their
+    subgoals themselves, triangles on the axis mark when.
 
     Args:
         tasks: results, one row each.
@@ -79,6 +83,8 @@ def plot_curves(
                 for group in task.groups:
                     _draw_intervals(place, group, panel, scale, styles[group.label][0])
             finish_panel(place, panel)
+            for group in task.groups:
+                _draw_discoveries(place, group, axis, scale, styles[group.label][0])
             place.set_xlabel(unit if task is tasks[-1] else "")
             if log_x:
                 place.set_xscale("log")
@@ -88,7 +94,7 @@ def plot_curves(
             if not place.has_data():
                 place.set(xticks=[], yticks=[])
     handles = [_group_handle(with_seeds(label, tasks), style, panels) for label, style in styles.items()]
-    explained = [*_meaning_handles(panels), *reference_handles(tasks, panels)]
+    explained = [*_meaning_handles(panels), *_discovery_handles(tasks), *reference_handles(tasks, panels)]
     add_legend(figure, handles, explained, caption_of(tasks, center))
     save(figure, paths)
 
@@ -117,6 +123,20 @@ def _draw_intervals(place: Axes, group: Group, panel: Panel, scale: float, color
     if panel.points and (points := group.estimates.get(panel.points)):
         look: Any = {"fmt": "none", "ecolor": color, "elinewidth": 0.8, "errorevery": _every(points), "zorder": 3}
         place.errorbar(points.x * scale, points.value, yerr=distances(points), **look)
+
+
+def _draw_discoveries(place: Axes, group: Group, axis: str, scale: float, color: str) -> None:
+    """Marks on the axis where the runs of a group found subgoals."""
+    x = np.concatenate([np.empty(0), *(found_at(run, axis=axis) for run in group.runs)]) * scale
+    if len(x):
+        look: Any = {**_DISCOVERY, "transform": place.get_xaxis_transform(), "clip_on": False, "zorder": 4}
+        place.plot(x, np.zeros_like(x), color=color, **look)
+
+
+def _discovery_handles(tasks: Sequence[TaskResults]) -> list[Line2D]:
+    if not any(len(found_at(run)) for task in tasks for group in task.groups for run in group.runs):
+        return []
+    return [Line2D([], [], color=GREY, label="a subgoal was found", **_DISCOVERY)]
 
 
 def _has_markers(panel: Panel) -> bool:

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.ticker import PercentFormatter
+from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import NDArray
 
 from hdrqn_torchrl.analysis.estimates import Center, Estimate, Group, TaskResults
@@ -38,6 +38,7 @@ PAPER = tuple(Panel(f"behaviour/{name}", f"greedy/{name}") for name in ("return"
 """The paper's four curves, with greedy evaluations as points beside."""
 GREEDY = tuple(Panel(f"greedy/{name}") for name in ("return", "success", "in_order", "steps"))
 FINALS = GREEDY
+DISCOVERY = (Panel("discovery/subgoals", label="subgoals found"), PAPER[0], Panel("greedy/success"))
 
 _QUANTITIES = {  # by the last part of a column's name
     "return": "reward per episode",
@@ -147,6 +148,8 @@ def finish_panel(place: Axes, panel: Panel, lying: bool = False) -> None:
     if known and is_share(name):
         (place.set_xlim if lying else place.set_ylim)(-0.03, 1.05)
         values.set_major_formatter(PercentFormatter(1.0))
+    if source == "discovery":  # whole numbers
+        values.set_major_locator(MaxNLocator(5, integer=True))
     place.grid(alpha=0.25, linewidth=0.6)
 
 
