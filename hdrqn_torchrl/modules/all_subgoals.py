@@ -106,7 +106,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         self._carried = carried_by(self.sub_exploration, exploration_key)
         for exploration, each in zip(self.subgoal_explorations, subgoal_keys, strict=True):
             self._carried |= carried_by(exploration, each.exploration)
-        carried = [*self.state_keys, previous_action_key, *self._carried]
+        self.exploration_keys: list[NestedKey] = list(self._carried)
+        carried = [*self.state_keys, previous_action_key, *self.exploration_keys]
         books = [key for each in subgoal_keys for key in (each.option_init, each.active_subgoal, each.subgoal_mask)]
         masks = [] if action_mask_key is None else [action_mask_key]
         self.in_keys = [observation_key, init_key, *masks, *books, *carried]

@@ -94,7 +94,8 @@ class SubController(TensorDictModuleBase):
         """Whether acting, too, writes its Q-values; for those who watch."""
         self.in_keys = [observation_key, *(key for key in (subgoal_key, mask_key) if key is not None), init_key]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
-        carried = [*self.state_keys, *carried_by(self.exploration, exploration_key)]
+        self.exploration_keys: list[NestedKey] = list(carried_by(self.exploration, exploration_key))
+        carried = [*self.state_keys, *self.exploration_keys]
         self.in_keys += carried
         self.out_keys = [action_key, *(_next(key) for key in carried)]
 
@@ -234,9 +235,10 @@ class MetaController(TensorDictModuleBase):
         self.in_keys = [*self.input_keys, *(key for key in (mask_key, condition_key, init_key) if key is not None)]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
         self._carried = carried_by(self.exploration, exploration_key)
-        self.acting_keys += self._carried
+        self.exploration_keys: list[NestedKey] = list(self._carried)
+        self.acting_keys += self.exploration_keys
         self.in_keys += self.state_keys
-        self.out_keys = [subgoal_key, *(_next(key) for key in (*self.state_keys, *self._carried))]
+        self.out_keys = [subgoal_key, *(_next(key) for key in (*self.state_keys, *self.exploration_keys))]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
