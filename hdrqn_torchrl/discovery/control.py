@@ -11,18 +11,20 @@ from torch import Tensor
 
 from hdrqn_torchrl import keys
 
-_TRIALS = 3  # before that, a head may still be learning
+_TRIALS = 6  # in a row; a head may still be learning, and most actions may be random
+_EXPECTED = 20  # times in a trial; fewer tell nothing
 
 
 class Control:
     """Counts how often subgoals are attained while they are pursued, and while others are.
 
-    A subgoal fails if, after ``trial_steps`` steps in its pursuit and as many again (three times), it was attained
-    less than 1.2 times as often as in the pursuit of others, where it was available.
+    A trial has at least ``trial_steps`` steps in pursuit of a subgoal, and so many that it would be attained 20 times
+    if its pursuit made no difference. A subgoal fails if in six trials in a row it was attained less than 1.2 times as
+    often as in the pursuit of others, where it was available.
 
     Args:
         num_subgoals: G.
-        trial_steps: steps of a trial.
+        trial_steps: least number of steps of a trial.
         gain: how much more often it has to be attained.
     """
 
@@ -31,6 +33,7 @@ class Control:
         self.counts = torch.zeros((4, num_subgoals), dtype=torch.int64)
         """Steps in pursuit, attained in pursuit, other steps, attained in these, ``[4, G]``, of the last trial."""
         self.trials = torch.zeros(num_subgoals, dtype=torch.int64)
+        """Trials in a row that showed no control."""
         self.failed = torch.zeros(num_subgoals, dtype=torch.bool)
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -44,11 +47,11 @@ class Control:
         self.counts += torch.stack([_total(each & there) for each in (pursued, pursued & attained, ~pursued)] + [
             _total(~pursued & attained & there)
         ])  # fmt: skip
-        over = self.counts[0] >= self.trial_steps
         expected = self.counts[3].double() / self.counts[2].clamp(min=1) * self.counts[0]
-        weak = over & (self.counts[1] < self.gain * expected)
-        self.trials += over.long()
-        self.failed |= weak & (self.trials >= _TRIALS)
+        over = (self.counts[0] >= self.trial_steps) & (expected >= _EXPECTED)
+        weak = self.counts[1] < self.gain * expected
+        self.trials = torch.where(over, torch.where(weak, self.trials + 1, 0), self.trials)
+        self.failed |= self.trials >= _TRIALS
         self.counts.masked_fill_(over, 0)
 
     def fails(self, subgoal: int) -> bool:

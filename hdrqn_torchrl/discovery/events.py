@@ -34,8 +34,9 @@ class EventSelection:
     3. While slots are free: deeds, that is, changes made by actions that move nothing, the rarest last. What they are
        good for may not be known before they can be brought about.
 
-    Events with a negative reward, or with hazards, are none. A subgoal keeps its slot. It is dropped if pursuing it
-    does not bring it about (:class:`~hdrqn_torchrl.discovery.control.Control`); a deed is, too, if its slot is needed.
+    Events with a negative reward, or with hazards, are none. A subgoal keeps its slot, but for deeds: one is dropped if
+    its slot is needed, or if pursuing it does not bring it about (:class:`~hdrqn_torchrl.discovery.control.Control`);
+    then it comes back only if it pays or leads.
 
     Args:
         detector: whose tokens they are.
@@ -70,9 +71,8 @@ class EventSelection:
         history = self._record.history()
         events = events_of(history, self.detector.precedence(), least=self.least)
         found = Occurrences(history, events)
-        allowed = [token not in self._dropped for token in events]
         for index, reason in self._wanted(found, history):
-            if allowed[index]:
+            if reason != DEED or events[index] not in self._dropped:
                 self._keep(events[index], reason)
         return Chosen(slots=dict(self.slots), once=slots_attained_once(self.slots, found))
 
@@ -115,9 +115,9 @@ class EventSelection:
         return slot
 
     def _drop(self) -> None:
-        """Drops what pursuing does not bring about."""
+        """Drops deeds that pursuing does not bring about."""
         for token, slot in list(self.slots.items()):
-            if self.control.fails(slot):
+            if self.reasons[token] == DEED and self.control.fails(slot):
                 self._dropped.append(token)
                 self._free(token)
 

@@ -48,8 +48,8 @@ class Discovery:
             self._teach(batch)
             return
         self.selection.observe(batch)
-        interval = self.settings.discovery_frames
-        if self.frames // interval > before // interval and self.frames <= self.settings.until_frames:
+        interval, until = self.settings.discovery_frames, self.settings.until_frames
+        if self.frames // interval > before // interval and (until is None or self.frames <= until):
             self._discover()
 
     def _teach(self, batch: TensorDictBase) -> None:

@@ -27,7 +27,7 @@ class DiscoverySettings:
         warmup_frames: environment frames in which the agent learns how its movements change what it sees; what was
             stored meanwhile is forgotten, as its events are unknown.
         discovery_frames: frames between two looks for subgoals.
-        until_frames: frames after which the set stays as it is.
+        until_frames: frames after which the set stays as it is; ``None``: never, as rewards may come late.
         choice: ``"useful"``: events that matter. For controls: ``"random_events"``, drawn among all events, and
             ``"random_changes"``, drawn among all changes of what is seen, even those that movements explain.
         random_subgoals: number of subgoals that are drawn; ``None``: ``max_subgoals``.
@@ -39,14 +39,15 @@ class DiscoverySettings:
     max_subgoals: int = 8
     warmup_frames: int = 10_000
     discovery_frames: int = 20_000
-    until_frames: int = 400_000
+    until_frames: int | None = None
     choice: Choice = "useful"
     random_subgoals: int | None = None
 
     def __post_init__(self) -> None:
         for name, usual in (("max_subgoals", 8), ("warmup_frames", 10_000), ("discovery_frames", 20_000)):
             check_size(name, getattr(self, name), usual)
-        check_size("until_frames", self.until_frames, 400_000)
+        if self.until_frames is not None:
+            check_size("until_frames", self.until_frames, "None, as long as the training lasts")
         if self.choice not in (known := get_args(Choice)):
             raise ValueError(f"choice must be one of {', '.join(known)}, got {self.choice!r}; 'useful' is no control.")
         number = self.random_subgoals
