@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -29,7 +30,8 @@ class LearnerSettings:
             what suits the task (see :func:`~hdrqn_torchrl.algorithms.make_v3`).
         batch_size: number of sequences in a minibatch.
         batch_scale: minibatches are so many times as large, and updates so many times as rare: each step is replayed as
-            often. For many worlds on a GPU, which takes a large minibatch in little more time than a small one.
+            often. Rates of Adam and of the target network change with it (:meth:`scaled`). For many worlds on a GPU,
+            which takes a large minibatch in little more time than a small one.
         capacity: number of transitions that the replay memory holds.
         frames_per_update: environment frames between two updates; 0.5 is two updates a frame.
         warmup_frames: environment frames before the first update.
@@ -144,6 +146,9 @@ class LearnerSettings:
     def scaled(self) -> LearnerSettings:
         """The same settings without ``batch_scale``: what it means is in the others.
 
+        The target network follows as fast in frames as without it, and Adam's rate grows with the root of the scale, as
+        the noise of gradients falls by it (Malladi et al., 2022).
+
         Examples:
             >>> settings = LearnerSettings(batch_size=32, frames_per_update=20, batch_scale=4).scaled()
             >>> settings.batch_size, settings.frames_per_update
@@ -151,8 +156,16 @@ class LearnerSettings:
         """
         if self.batch_scale == 1:
             return self
-        size, frames = self.batch_scale * self.batch_size, self.batch_scale * self.frames_per_update
-        return replace(self, batch_size=size, frames_per_update=frames, batch_scale=1)
+        scale, end = self.batch_scale, self.learning_rate_end
+        return replace(
+            self,
+            batch_size=scale * self.batch_size,
+            frames_per_update=scale * self.frames_per_update,
+            learning_rate=self.learning_rate * math.sqrt(scale),
+            learning_rate_end=None if end is None else end * math.sqrt(scale),
+            tau=1.0 - (1.0 - self.tau) ** scale,
+            batch_scale=1,
+        )
 
     def rate_at(self, frames: int) -> float:
         """Adam's rate after so many frames."""

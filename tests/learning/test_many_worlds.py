@@ -1,5 +1,7 @@
 """More worlds, larger minibatches: each step is replayed as often."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import build, collect, small_env, tiny_settings
@@ -33,11 +35,14 @@ def test_4096_worlds_replay_each_step_as_often_as_32_do(name):
     assert many == pytest.approx(few, rel=0.12)  # the last batch of the few is not learned from yet
 
 
-def test_a_scale_changes_size_and_number_of_minibatches_only():
-    settings = LearnerSettings(batch_size=8, frames_per_update=0.5, batch_scale=6, tau=0.01)
+def test_a_scale_keeps_the_pace_in_frames_of_replay_and_target_network():
+    settings = LearnerSettings(batch_size=8, frames_per_update=0.5, batch_scale=4, tau=0.01, learning_rate_end=None)
     scaled = settings.scaled()
-    assert (scaled.batch_size, scaled.frames_per_update, scaled.batch_scale) == (48, 3.0, 1)
-    assert scaled.scaled() == scaled and scaled.tau == 0.01
+    assert (scaled.batch_size, scaled.frames_per_update, scaled.batch_scale) == (32, 2.0, 1)
+    assert 1.0 - scaled.tau == pytest.approx(0.99**4)
+    assert (scaled.learning_rate, scaled.learning_rate_end) == (2 * settings.learning_rate, None)
+    assert replace(settings, learning_rate_end=1e-4).scaled().learning_rate_end == pytest.approx(2e-4)
+    assert scaled.scaled() == scaled
     with pytest.raises(ValueError, match="batch_scale must be >= 1, got 0; use 1"):
         LearnerSettings(batch_scale=0)
 
