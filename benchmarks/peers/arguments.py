@@ -15,7 +15,7 @@ class Arguments:
     """The same for every peer.
 
     Args:
-        id: of a MiniGrid or BabyAI task.
+        id: of a MiniGrid or BabyAI task, or the name of a grid world (tasks.py).
         seed: of the training.
         frames: environment steps of the training, all worlds together.
         seconds: wall time after which a training stops, evaluations included; the same command goes on with more.

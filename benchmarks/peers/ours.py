@@ -19,6 +19,7 @@ from typing import Any
 
 from arguments import Arguments
 from evaluations import Evaluation, read, write
+from tasks import settings_of_task
 
 ROOT = Path(__file__).parents[2]
 _STOPS = (signal.SIGTERM, signal.SIGINT)
@@ -49,12 +50,10 @@ class OurArguments(Arguments):
 def settings_of(arguments: OurArguments) -> list[str]:
     """What ``train.py`` is told; it goes on with a run that lies in the folder already."""
     return [
-        "env=minigrid",
-        f"env.id={arguments.id}",
+        *settings_of_task(arguments.id, max_steps=arguments.max_steps),
         "algo=v3",
         f"algo.levels={arguments.levels}",
         f"algo.bonus_reward={arguments.bonus}",
-        *([f"env.max_steps={arguments.max_steps}"] if arguments.max_steps else []),
         f"seed={arguments.seed}",
         f"total_frames={arguments.frames}",
         "device=cpu",

@@ -7,23 +7,25 @@ The same command goes on where it was stopped, from the last evaluation; episode
 from __future__ import annotations
 
 import sys
-import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from arguments import Arguments
-from evaluations import Evaluation, append, read, write
+from gymnasium import spaces
+from numpy.typing import NDArray
 from sb3_contrib import RecurrentPPO
+from stable_baselines3.common.vec_env import VecEnv
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
-from torchrl.envs import EnvBase, InitTracker, TransformedEnv
-from worlds import PeerVecEnv, Player
+from training import Training
+from worlds import OneHot, Worlds
 
-from hdrqn_torchrl.envs import make_minigrid
-from hdrqn_torchrl.runs.evaluation import evaluate
+from hdrqn_torchrl import keys
 
-AGENT = "recurrent_ppo"
 NUM_ENVS = 16
 SETTINGS: dict[str, Any] = {
     "n_steps": 128,
@@ -40,123 +42,142 @@ SETTINGS: dict[str, Any] = {
 }
 """Those that MiniGrid's own starter files use for PPO, but half their learning rate and sequences of a whole rollout.
 The memory is as large as ours; actor and critic each have one, as sb3-contrib has it."""
-EVALUATION_ENVS, EVALUATION_SEED = 100, 1_000_000
-"""As in ``conf/config.yaml``; like there, the last evaluation has the next seed."""
 
 
-class Run:
-    """A training and what it has shown so far.
+class PeerVecEnv(VecEnv):
+    """Worlds as Stable-Baselines3 wants them.
+
+    Args:
+        worlds: N of them.
+    """
+
+    def __init__(self, worlds: Worlds) -> None:
+        self.worlds = worlds
+        shown = spaces.Box(0.0, 1.0, (worlds.encode.size,), np.float32)
+        super().__init__(worlds.number, shown, spaces.Discrete(worlds.num_actions))
+        self._actions: NDArray[np.int64] | None = None
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Seeds all episodes from the next reset on."""
+        self.worlds.env.set_seed(seed)
+        return [seed] * self.num_envs
+
+    def reset(self) -> NDArray[np.float32]:
+        """New episodes in all worlds."""
+        return self.worlds.reset()
+
+    def step_async(self, actions: NDArray[np.int64]) -> None:
+        """Takes the actions ``[N]``."""
+        self._actions = actions
+
+    def step_wait(self) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+        """One step; a new episode begins where one ended."""
+        assert self._actions is not None, "step_async comes first"
+        found = self.worlds.step(self._actions)
+        done = found.terminated | found.truncated
+        infos: list[dict[str, Any]] = [{} for _ in done]
+        for index in done.nonzero()[0]:
+            truncated = bool(found.truncated[index])
+            infos[index] = {"terminal_observation": found.last[index], "TimeLimit.truncated": truncated}
+        return found.shown, found.reward, done, infos
+
+    def close(self) -> None:
+        """Closes all worlds."""
+        self.worlds.env.close()
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The same for all worlds; there are no pictures."""
+        return [None if attr_name == "render_mode" else getattr(self.worlds.env, attr_name)] * self.num_envs
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """Not possible."""
+        raise NotImplementedError("worlds of a batch have no attributes of their own.")
+
+    def env_method(self, method_name: str, *method_args, indices: Any = None, **method_kwargs) -> list[Any]:
+        """Not possible."""
+        raise NotImplementedError("worlds of a batch have no methods of their own.")
+
+    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+        """None is."""
+        return [False] * self.num_envs
+
+
+class Player(TensorDictModuleBase):
+    """A recurrent agent of sb3-contrib that plays in an environment of ours.
+
+    Args:
+        model: the agent.
+        encode: as in its training.
+        greedy: whether it plays its likeliest actions or draws them.
+    """
+
+    def __init__(self, model: RecurrentPPO, encode: OneHot, *, greedy: bool = True) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = [keys.OBSERVATION, keys.IS_INIT], [keys.ACTION]
+        self.policy, self.encode, self.greedy = model.policy, encode, greedy
+        self._state: tuple[NDArray, ...] | None = None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes ``action``; the memory starts anew where ``is_init`` is set."""
+        action, self._state = self.policy.predict(
+            self.encode(tensordict[keys.OBSERVATION]),
+            state=self._state,
+            episode_start=tensordict[keys.IS_INIT].squeeze(-1).numpy(),
+            deterministic=self.greedy,
+        )
+        return tensordict.set(keys.ACTION, torch.as_tensor(action))
+
+
+class RecurrentPPOTraining(Training):
+    """A training, or what was left of it.
 
     Args:
         arguments: what was asked for.
     """
 
     def __init__(self, arguments: Arguments) -> None:
-        self.arguments = arguments
-        name = arguments.name_of(AGENT)
-        self.results, self.checkpoint = arguments.results / f"{name}.jsonl", arguments.runs / f"{name}.zip"
-        self.worlds = PeerVecEnv(self._make(NUM_ENVS), bonus=arguments.bonus)
-        self.model = self._begin()
-        known = [each for each in read(self.results) if each.frames <= self.model.num_timesteps]
-        write(self.results, known if self.model.num_timesteps else [])
-        env = self._make(min(EVALUATION_ENVS, arguments.episodes), seed=EVALUATION_SEED)
-        self.evaluation_env = TransformedEnv(env, InitTracker())
-        self._start_clock(known[-1] if self.model.num_timesteps else None)
+        super().__init__(arguments, "recurrent_ppo")
+        self.checkpoint = arguments.runs / f"{self.name}.zip"
+        self.worlds = Worlds(self.make(NUM_ENVS), bonus=arguments.bonus)
+        self.model = self._begin(PeerVecEnv(self.worlds))
+        self.resume()
 
-    def _start_clock(self, before: Evaluation | None) -> None:
-        """Time goes on from that of the last evaluation."""
-        self._before, self._started, self._cpu_started = before, time.monotonic(), time.process_time()
-
-    def _begin(self) -> RecurrentPPO:
+    def _begin(self, env: PeerVecEnv) -> RecurrentPPO:
         """The agent as it was saved last, or a new one."""
+        seed = self.arguments.seed
         if not self.checkpoint.exists():
-            return RecurrentPPO("MlpLstmPolicy", self.worlds, seed=self.arguments.seed, device="cpu", **SETTINGS)
-        model = RecurrentPPO.load(self.checkpoint, self.worlds, device="cpu")
-        later = np.random.SeedSequence([self.arguments.seed, model.num_timesteps]).generate_state(1)[0]
+            return RecurrentPPO("MlpLstmPolicy", env, seed=seed, device="cpu", **SETTINGS)
+        model = RecurrentPPO.load(self.checkpoint, env, device="cpu")
+        later = np.random.SeedSequence([seed, model.num_timesteps]).generate_state(1)[0]
         model.set_random_seed(int(later) >> 1)  # not the first episodes again
         return model
 
-    def _make(self, num_envs: int, seed: int | None = None) -> EnvBase:
-        return make_minigrid(self.arguments.id, num_envs, max_steps=self.arguments.max_steps or None, seed=seed)
-
     @property
-    def seconds(self) -> float:
-        """Wall time of the training so far."""
-        return (self._before.seconds if self._before else 0.0) + time.monotonic() - self._started
+    def frames(self) -> int:
+        """As its own counter has it."""
+        return self.model.num_timesteps
 
-    @property
-    def cpu_seconds(self) -> float:
-        """Time of a processor."""
-        before = self._before.cpu_seconds if self._before else None
-        return (before or 0.0) + time.process_time() - self._cpu_started
+    def advance(self) -> None:
+        """One rollout."""
+        self.model.learn(NUM_ENVS * self.model.n_steps, reset_num_timesteps=False)
 
-    @property
-    def is_over(self) -> bool:
-        """Whether frames or time are used up."""
-        return self.model.num_timesteps >= self.arguments.frames or self.seconds >= self.arguments.seconds
+    def player(self, *, greedy: bool) -> Player:
+        """It plays its likeliest actions or draws them."""
+        return Player(self.model, self.worlds.encode, greedy=greedy)
 
-    def train(self) -> None:
-        """Rollout after rollout, with evaluations between them."""
-        arguments, rollout = self.arguments, NUM_ENVS * self.model.n_steps
-        if not self.model.num_timesteps:
-            self.record()
-        over = self.is_over
-        while not over:
-            before = self.model.num_timesteps // arguments.interval_frames
-            self.model.learn(rollout, reset_num_timesteps=False)
-            over = self.is_over
-            if over:
-                self.record(final=True)
-            elif self.model.num_timesteps // arguments.interval_frames > before:
-                self.record()
-
-    def record(self, *, final: bool = False) -> None:
-        """Plays, writes a line, then saves: a checkpoint's line is always there.
-
-        Ours has no other way to play than the greedy one, so the time of the second evaluation does not count.
-        """
-        arguments = self.arguments
-        found = self.evaluate(final=final, greedy=True)
-        seconds, cpu_seconds = self.seconds, self.cpu_seconds  # until here
-        told = Evaluation(
-            agent=AGENT,
-            id=arguments.task,
-            bonus=arguments.bonus,
-            seed=arguments.seed,
-            frames=self.model.num_timesteps,
-            seconds=seconds,
-            cpu_seconds=cpu_seconds,
-            episodes=int(found["episodes"]),
-            return_mean=found["return_mean"],
-            success_rate=found["success_rate"],
-            steps_mean=found["steps_mean"],
-            sampled_success_rate=self.evaluate(final=final, greedy=False)["success_rate"],
-        )
-        append(self.results, told)
-        print(told, flush=True)
-        save(self.model, self.checkpoint)
-        self._start_clock(told)
-
-    def evaluate(self, *, final: bool, greedy: bool) -> dict[str, float]:
-        """The averages of episodes."""
-        episodes = self.arguments.final_episodes if final else self.arguments.episodes
-        player = Player(self.model, self.worlds.encode, greedy=greedy)
-        return evaluate(self.evaluation_env, player, episodes=episodes, seed=EVALUATION_SEED + final)
-
-
-def save(model: RecurrentPPO, path: Path) -> None:
-    """Replaces the last checkpoint, which stays whole until then."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_suffix(".new.zip")
-    model.save(new)
-    new.replace(path)
+    def save(self) -> None:
+        """Replaces the last checkpoint, which stays whole until then."""
+        self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        new: Path = self.checkpoint.with_suffix(".new.zip")
+        self.model.save(new)
+        new.replace(self.checkpoint)
 
 
 def main() -> None:
     """One run."""
     torch.set_num_threads(1)
     torchrl_logger.setLevel("WARNING")  # it writes to standard output
-    Run(Arguments.read(sys.argv[1:])).train()
+    RecurrentPPOTraining(Arguments.read(sys.argv[1:])).train()
 
 
 if __name__ == "__main__":

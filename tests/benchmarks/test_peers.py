@@ -7,6 +7,7 @@ import numpy as np
 import ours
 import pytest
 import table
+import tasks
 from arguments import Arguments
 from evaluations import Evaluation, append, read, write
 from hydra import compose, initialize_config_dir
@@ -14,7 +15,7 @@ from ours import OurArguments
 from run_folders import CONF
 
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.runs.building import build_algorithm
+from hdrqn_torchrl.runs.building import build_algorithm, build_env
 
 TASK = "MiniGrid-DoorKey-8x8-v0"
 
@@ -49,6 +50,13 @@ class TestArguments:
     def test_wrong_words_end_the_program_with_a_sentence(self, words, sentence):
         with pytest.raises(SystemExit, match=sentence):
             Arguments.read(words)
+
+
+@pytest.mark.parametrize("name", tasks.GRID_WORLDS)
+def test_a_grid_world_is_the_same_for_all_agents(name):
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = compose("config", overrides=ours.settings_of(OurArguments(id=name, max_steps=40)))
+    assert build_env(resolved(config), {}).settings == tasks.make_task(name, config.env.num_envs, max_steps=40).settings
 
 
 def test_results_survive_on_disk_and_a_line_that_was_cut_off_does_not(tmp_path):

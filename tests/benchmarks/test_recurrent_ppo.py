@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from torchrl.data import Unbounded
 from torchrl.envs import InitTracker, TransformedEnv
 
 pytest.importorskip("minigrid")
@@ -11,7 +12,9 @@ pytest.importorskip("sb3_contrib")
 import recurrent_ppo
 from arguments import Arguments
 from evaluations import read
-from worlds import OneHot, PeerVecEnv, Player
+from recurrent_ppo import PeerVecEnv, Player, RecurrentPPOTraining
+from training import EVALUATION_SEED
+from worlds import OneHot, Worlds
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv, make_minigrid
 from hdrqn_torchrl.runs.evaluation import evaluate, play
@@ -44,7 +47,7 @@ def ours():
 
 def codes_of(env, observation):
     """Codes of one-hot observations ``[N, S]``."""
-    numbers = (env.env.observation_spec["observation"].high[0].long() + 1).tolist()
+    numbers = (env.worlds.env.observation_spec["observation"].high[0].long() + 1).tolist()
     parts = torch.tensor(observation).split(numbers, -1)
     assert all(bool((part.sum(-1) == 1).all()) for part in parts)
     return torch.stack([part.argmax(-1) for part in parts], -1)
@@ -52,7 +55,7 @@ def codes_of(env, observation):
 
 class TestPeerVecEnv:
     def test_every_step_is_that_of_our_environment(self, ours):
-        env = PeerVecEnv(task())
+        env = PeerVecEnv(Worlds(task()))
         first, found = steps(env)
         assert torch.equal(codes_of(env, first), ours[0].long())
         ends = 0
@@ -68,14 +71,14 @@ class TestPeerVecEnv:
         assert ends >= 40
 
     def test_the_bonus_is_for_what_our_agents_count_as_attained(self, ours):
-        _, found = steps(PeerVecEnv(task(), bonus=0.5))
+        _, found = steps(PeerVecEnv(Worlds(task(), bonus=0.5)))
         attained = torch.stack([after["attained"].sum(-1) for after, _ in ours[1]])
         plain = torch.stack([after["reward"].squeeze(-1) for after, _ in ours[1]])
         assert attained.sum() > 10
         assert np.allclose(np.stack([reward for _, reward, _, _ in found]), plain + 0.5 * attained)
 
     def test_a_seed_repeats_and_another_does_not(self):
-        env = PeerVecEnv(task())
+        env = PeerVecEnv(Worlds(task()))
         runs = []
         for seed in (3, 3, 4):
             env.seed(seed)
@@ -85,11 +88,17 @@ class TestPeerVecEnv:
 
     def test_a_bonus_without_subgoals_is_refused(self):
         with pytest.raises(ValueError, match="bonus must be 0 for a task without subgoals, got 1"):
-            PeerVecEnv(make_minigrid(TASK, 1, subgoals=None), bonus=1)
+            Worlds(make_minigrid(TASK, 1, subgoals=None), bonus=1)
 
-    def test_what_is_no_code_vector_is_refused(self):
-        with pytest.raises(ValueError, match="env must show a vector of codes"):
-            OneHot(MultiGoalGridEnv(num_envs=1).observation_spec["observation"])
+    def test_what_are_no_codes_is_refused(self):
+        with pytest.raises(ValueError, match="env must show codes"):
+            OneHot(Unbounded((1, 3)))
+
+    def test_cells_are_codes_too(self):
+        env = MultiGoalGridEnv(num_envs=2, seed=0)
+        cells = env.reset()["observation"]
+        shown = Worlds(env).encode(cells).reshape(2, 5, 5, -1)
+        assert np.array_equal(shown.argmax(-1), cells.numpy()) and np.array_equal(shown.sum(-1), np.ones((2, 5, 5)))
 
 
 @pytest.fixture
@@ -107,7 +116,7 @@ def asked(folder, **more):
 @pytest.mark.usefixtures("tiny")
 class TestRun:
     def test_an_evaluation_plays_the_worlds_of_all_agents_and_keeps_no_memory(self, tmp_path):
-        run = recurrent_ppo.Run(asked(tmp_path))
+        run = RecurrentPPOTraining(asked(tmp_path))
         seen = []
 
         class Watching(Player):
@@ -125,20 +134,20 @@ class TestRun:
         assert all(torch.equal(a, b) for a, b in zip(seen[:half], seen[half:], strict=True))
 
     def test_a_run_goes_on_from_its_last_checkpoint(self, tmp_path):
-        recurrent_ppo.Run(asked(tmp_path, frames=32)).train()
+        RecurrentPPOTraining(asked(tmp_path, frames=32)).train()
         (path,) = tmp_path.glob("*.jsonl")
         not_saved = path.read_text().splitlines(keepends=True)[-1].replace('"frames": 32', '"frames": 48')
         path.write_text(path.read_text() + not_saved)
-        run = recurrent_ppo.Run(asked(tmp_path, frames=64))
+        run = RecurrentPPOTraining(asked(tmp_path, frames=64))
         assert run.model.num_timesteps == 32 and run.seconds > read(path)[-1].seconds
         run.train()
         assert [each.frames for each in read(path)] == [0, 16, 32, 48, 64]
         assert [each.episodes for each in read(path)] == [2, 2, 4, 2, 4]
-        recurrent_ppo.Run(asked(tmp_path, frames=64)).train()
+        RecurrentPPOTraining(asked(tmp_path, frames=64)).train()
         assert len(read(path)) == 5
 
     def test_time_that_is_up_ends_a_run_with_the_final_evaluation(self, tmp_path, monkeypatch):
-        run = recurrent_ppo.Run(asked(tmp_path, seconds=1000.0))
+        run = RecurrentPPOTraining(asked(tmp_path, seconds=1000.0))
         learn = run.model.learn
 
         def slowly(*args, **kwargs):
@@ -151,7 +160,7 @@ class TestRun:
         assert read(run.results)[-1].seconds > 1200.0
 
     def test_the_second_evaluation_draws_actions_and_takes_no_time(self, tmp_path, monkeypatch):
-        run = recurrent_ppo.Run(asked(tmp_path))
+        run = RecurrentPPOTraining(asked(tmp_path))
         evaluate, asked_for = run.evaluate, []
 
         def slowly(*, final, greedy):
@@ -166,7 +175,7 @@ class TestRun:
         assert told.seconds < 500.0 and run.seconds < 500.0
 
     def test_drawn_actions_differ_from_the_likeliest(self, tmp_path):
-        run = recurrent_ppo.Run(asked(tmp_path))
+        run = RecurrentPPOTraining(asked(tmp_path))
         shown = TransformedEnv(task(), InitTracker()).reset()
         for greedy, number in ((True, 1), (False, 6)):
             player = Player(run.model, run.worlds.encode, greedy=greedy)
@@ -175,16 +184,16 @@ class TestRun:
     def test_a_seed_repeats(self, tmp_path):
         lines = []
         for name in "ab":
-            recurrent_ppo.Run(asked(tmp_path / name, frames=16)).train()
+            RecurrentPPOTraining(asked(tmp_path / name, frames=16)).train()
             (path,) = (tmp_path / name).glob("*.jsonl")
             lines.append([(each.frames, each.return_mean, each.steps_mean) for each in read(path)])
         assert lines[0] == lines[1]
 
     def test_what_is_learned_is_what_is_evaluated(self, tmp_path):
-        run = recurrent_ppo.Run(asked(tmp_path, frames=32))
+        run = RecurrentPPOTraining(asked(tmp_path, frames=32))
         before = [each.clone() for each in run.model.policy.parameters()]
         run.train()
         assert any(not torch.equal(a, b) for a, b in zip(before, run.model.policy.parameters(), strict=True))
         player = Player(run.model, run.worlds.encode)
-        found = evaluate(run.evaluation_env, player, episodes=4, seed=recurrent_ppo.EVALUATION_SEED + 1)
+        found = evaluate(run.evaluation_env, player, episodes=4, seed=EVALUATION_SEED + 1)
         assert found["steps_mean"] == read(run.results)[-1].steps_mean
