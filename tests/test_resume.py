@@ -30,6 +30,12 @@ def cart_and_pole(num_envs, seed=0):
     return make_gym("CartPole-v1", num_envs, max_steps=7, seed=seed)
 
 
+FINDING = HandGiven(
+    max_subgoals=2,
+    warmup_frames=BATCH,
+    discovery_frames=2 * BATCH,
+    chosen=(Chosen({1: 1}), BOTH_GOALS, Chosen({2: 1}, once=(1,))),
+)
 TRAININGS = {
     "drqn": partial(make_training, name="drqn", learner={"sampling": "episodes", "max_grad_norm": 0.5}),
     "v1": partial(
@@ -66,19 +72,17 @@ TRAININGS = {
     ),
     "drqn-gymnasium": partial(make_training, name="drqn", worlds=cart_and_pole),
     "v3-minigrid": partial(make_training, name="v3", worlds=door_and_key),
+    "v2-discovered": partial(
+        make_training,
+        name="v2",
+        learner={"warmup_frames": BATCH},
+        options={"subgoals": "discovered", "discovery": FINDING, "sub_hindsight": True},
+    ),
     "v3-discovered": partial(
         make_training,
         name="v3",
         learner={"warmup_frames": BATCH},  # after a batch that memories forget
-        options={
-            "subgoals": "discovered",
-            "discovery": HandGiven(
-                max_subgoals=2,
-                warmup_frames=BATCH,
-                discovery_frames=2 * BATCH,
-                chosen=(Chosen({1: 1}), BOTH_GOALS, Chosen({2: 1}, once=(1,))),
-            ),
-        },
+        options={"subgoals": "discovered", "discovery": FINDING},
     ),
 }
 
@@ -194,6 +198,7 @@ PAIRS += [("v2-phases", cut) for cut in ("in an evaluation", "behind a row of me
 PAIRS += [(training, "between two updates") for training in TRAININGS if training.endswith(("r2d2", "whole", "levels"))]
 PAIRS += [(training, "with full memories") for training in ("v2-whole", "v3-r2d2")]
 PAIRS += [("v3-discovered", cut) for cut in ("during warm-up", *FEW)]
+PAIRS += [("v2-discovered", cut) for cut in FEW[:2]]
 PAIRS += [(training, "in the middle of options") for training in ("drqn-gymnasium", "v3-minigrid")]
 OTHERS = [("v2-odd", "in the first evaluation"), ("v3-r2d2", "in the first evaluation")]
 OTHERS += [("v1-r2d2", "with full memories")]

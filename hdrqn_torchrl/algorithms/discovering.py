@@ -14,7 +14,11 @@ from hdrqn_torchrl.learning import PhaseOne
 
 
 def finds_subgoals(
-    subgoals: Literal["given", "discovered"], *, levels: int = 2, phase_one: PhaseOne | None = None
+    subgoals: Literal["given", "discovered"],
+    *,
+    levels: int = 2,
+    phase_one: PhaseOne | None = None,
+    learns_all: bool = True,
 ) -> bool:
     """Whether an agent finds its subgoals itself.
 
@@ -22,6 +26,7 @@ def finds_subgoals(
         subgoals: ``"given"`` or ``"discovered"``.
         levels: of the agent.
         phase_one: how long it chooses subgoals at random.
+        learns_all: whether it learns about all subgoals from all steps.
 
     Raises:
         ValueError: if its other settings don't go with it.
@@ -32,6 +37,11 @@ def finds_subgoals(
         return False
     if levels != 2:
         raise ValueError(f"levels must be 2 with subgoals='discovered', got {levels}; it finds one set of subgoals.")
+    if not learns_all:
+        raise ValueError(
+            "sub_hindsight must be True with subgoals='discovered', got False; a subgoal is learned from steps that "
+            "were stored before it was found."
+        )
     if phase_one is not None:
         raise ValueError(
             "phase_one must be None with subgoals='discovered': it waits for options of every subgoal, and there are "
@@ -52,6 +62,7 @@ def finding_subgoals(algorithm: Algorithm, has: Requirements, settings: Discover
         ValueError: if events can't be told in observations of this kind.
     """
     device = next(algorithm.policy.parameters()).device
+    steps, *options = algorithm.learners.values()
     critic, selection = settings.make(has.observation, has.num_actions)
     critic.to(device)
     algorithm.policy.critic = critic  # only now: target networks have none
@@ -63,6 +74,6 @@ def finding_subgoals(algorithm: Algorithm, has: Requirements, settings: Discover
         levels=(*nearer, replace(farthest, choice_names=critic.names)),
         monitors={
             **algorithm.monitors,
-            "discovery": Discovery(critic, selection, list(algorithm.learners.values()), settings),
+            "discovery": Discovery(critic, selection, steps, settings, options=options),
         },
     )

@@ -108,8 +108,8 @@ class LevelBuilder:
         """What trains level 0: single steps."""
         level, has = self.has.levels[0], self.has
         pursued, hindsight = _keys_above(level), self.sub_hindsight
-        starts = [keys.IS_INIT] if settings.sampling in FROM_STARTS else []
-        told: list[NestedKey] = [pursued.attained, *has.hazard_keys] if hindsight else []
+        starts = [keys.IS_INIT] if settings.sampling in FROM_STARTS or has.event_keys else []
+        told: list[NestedKey] = [pursued.attained, *has.event_keys, *has.hazard_keys] if hindsight else []
         with settings_named(level.name):
             return Learner(
                 controller,

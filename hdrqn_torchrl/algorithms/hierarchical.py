@@ -13,9 +13,11 @@ from torchrl.envs.transforms import InitTracker
 from hdrqn_torchrl.algorithms import presets
 from hdrqn_torchrl.algorithms.base import Algorithm, copies_of
 from hdrqn_torchrl.algorithms.books import make_books
+from hdrqn_torchrl.algorithms.discovering import finding_subgoals, finds_subgoals
 from hdrqn_torchrl.algorithms.hdrqn_levels import LevelBuilder
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.algorithms.views import views_of
+from hdrqn_torchrl.discovery import DiscoverySettings, discovered_set
 from hdrqn_torchrl.learning import LearnerSettings, PhaseOne, phase_monitors
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, HierarchicalPolicy, MetaController, SubController
 from hdrqn_torchrl.modules.sizes import check_size
@@ -28,6 +30,8 @@ def make_hdrqn(
     *,
     version: Literal["v1", "v2"] = "v2",
     levels: int = 2,
+    subgoals: Literal["given", "discovered"] = "given",
+    discovery: DiscoverySettings = DiscoverySettings(),  # noqa: B008 (frozen)
     total_frames: int | None = None,
     sub: LearnerSettings = presets.SUB_LEARNER,
     meta: LearnerSettings | None = None,
@@ -65,6 +69,9 @@ def make_hdrqn(
         architecture: networks.
         version: what levels that choose subgoals read: ``"v1"`` the observation, ``"v2"`` the state of the level below.
         levels: L; the agent pursues the farthest L - 1 sets of subgoals of the task.
+        subgoals: ``"given"``: those of the task; ``"discovered"``: the agent finds them itself (docs/discovery.md), and
+            learns them by relabelling what it has stored (``sub_hindsight=True``).
+        discovery: how it finds them.
         total_frames: environment frames of the whole training, in which the learning rates fall; ``None``: as the
             settings have it (``learning_rate_frames``).
         sub, meta, middle: how each level learns; ``meta=None``: :data:`~hdrqn_torchrl.algorithms.presets.META_LEARNER`,
@@ -113,7 +120,10 @@ def make_hdrqn(
     sub, middle = sub.lasting(total_frames), (middle or meta).lasting(total_frames)
     _check_levels(levels, meta_hindsight, meta_input_time)
     _check_hindsight(sub, meta, sub_hindsight, meta_hindsight)
-    has = check_environment(env, architecture, builder="make_hdrqn" if recurrent else "make_hdqn", levels=levels)
+    finds = finds_subgoals(subgoals, levels=levels, phase_one=phase_one, learns_all=sub_hindsight)
+    own = discovered_set(discovery.max_subgoals) if finds else None
+    builder = "make_hdrqn" if recurrent else "make_hdqn"
+    has = check_environment(env, architecture, builder=builder, levels=levels, discovered=own)
     reads_last = version == "v2" and meta_input_time == "after_last_observation"
     build = LevelBuilder(
         has=has,
@@ -162,7 +172,7 @@ def make_hdrqn(
     controllers: list[SubController | MetaController] = [sub_controller, *uppers]
     primers = [controller.make_tensordict_primer() for controller in controllers]
     names, explorations = [level.name for level in has.levels], [sub_exploration, *middles, meta_exploration]
-    return Algorithm(
+    algorithm = Algorithm(
         policy=policy,
         learners=dict(zip(names, learners, strict=True)),
         explorations=dict(zip(names, explorations, strict=True)),
@@ -175,6 +185,7 @@ def make_hdrqn(
         ),
         monitors=phase_monitors(phase_one, has.subgoals, explorations[1:], learners[1:]),
     )
+    return finding_subgoals(algorithm, has, discovery) if finds else algorithm
 
 
 make_hdqn = partial(make_hdrqn, version="v1", recurrent=False, sub=presets.HDQN_SUB_LEARNER, meta=presets.META_LEARNER)

@@ -39,6 +39,7 @@ class Requirements:
         action_mask_key: the entry that marks the actions that can be chosen, or ``None``.
         hazard_key: the entry that marks the hazard; ``None`` if the environment or the agent has none.
         task: what the environment states about itself.
+        finds_subgoals: whether the agent finds them itself.
     """
 
     num_envs: int
@@ -49,6 +50,7 @@ class Requirements:
     action_mask_key: NestedKey | None
     hazard_key: NestedKey | None
     task: Task
+    finds_subgoals: bool = False
 
     @property
     def num_subgoals(self) -> int:
@@ -74,6 +76,11 @@ class Requirements:
     def hazard_keys(self) -> list[NestedKey]:
         """The hazard's entry, if there is one."""
         return [] if self.hazard_key is None else [self.hazard_key]
+
+    @property
+    def event_keys(self) -> list[NestedKey]:
+        """The entry with the events of a step, where the agent finds its subgoals itself."""
+        return [keys.EVENTS] if self.finds_subgoals else []
 
 
 def check_environment(
@@ -132,6 +139,7 @@ def check_environment(
         action_mask_key=keys.ACTION_MASK if keys.ACTION_MASK in entries else None,
         hazard_key=keys.HAZARD if levels > 1 and keys.HAZARD in entries else None,
         task=task,
+        finds_subgoals=discovered is not None,
     )
 
 

@@ -176,7 +176,7 @@ def make_v3(
         trained = Learner(
             policy,
             learner,
-            extract=_make_extract(loss, stored_states(policy, learner), [keys.EVENTS] if finds else []),
+            extract=_make_extract(loss, stored_states(policy, learner), has.event_keys),
             loss=loss,
             num_envs=has.num_envs,
             episode_len=has.task.max_steps,

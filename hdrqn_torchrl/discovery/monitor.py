@@ -26,19 +26,28 @@ class Discovery:
        (:func:`~hdrqn_torchrl.discovery.relabel`), so that new heads learn at once from all that was seen.
 
     A head whose slot gets another event is left as it is: it learns the new one from stored steps within a few hundred
-    updates, and what all heads have in common serves it, too.
+    updates, and what all heads have in common serves it, too. Options that pursued the old event can't be told anew:
+    where an agent learns from options, all memories begin empty then.
 
     Args:
         critic: of the agent.
         selection: chooses.
-        learners: whose memories are relabelled.
+        steps: learns from steps, whose memory is relabelled.
         settings: when.
+        options: learners whose memories hold options.
     """
 
     def __init__(
-        self, critic: EventCritic, selection: Selection, learners: Sequence[Learner], settings: DiscoverySettings
+        self,
+        critic: EventCritic,
+        selection: Selection,
+        steps: Learner,
+        settings: DiscoverySettings,
+        *,
+        options: Sequence[Learner] = (),
     ) -> None:
-        self.critic, self.selection, self.learners, self.settings = critic, selection, learners, settings
+        self.critic, self.selection, self.settings = critic, selection, settings
+        self.steps, self.options = steps, options
         self.frames = 0
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -57,17 +66,23 @@ class Discovery:
         after = batch.get("next").get(keys.OBSERVATION)
         self.critic.detector.observe(batch.get(keys.OBSERVATION), batch.get(keys.ACTION), after)
         if self.critic.detector.ready:
-            for learner in self.learners:
-                learner.begin_empty()
+            self._forget()
+
+    def _forget(self) -> None:
+        for learner in (self.steps, *self.options):
+            learner.begin_empty()
 
     def _discover(self) -> None:
         table, chosen = self.critic.table, self.selection.update()
+        in_use = table.in_use
         before = table.tokens.clone(), table.slots.clone(), table.once.clone()
         kept = table.assign(chosen.slots, once=chosen.once, frames=self.frames)
         if all(torch.equal(old, new) for old, new in zip(before, (table.tokens, table.slots, table.once), strict=True)):
             return
-        for learner in self.learners:
-            learner.rewrite(partial(relabel, table=table, kept=kept))
+        if self.options and (in_use & ~kept).any():
+            self._forget()
+        else:
+            self.steps.rewrite(partial(relabel, table=table, kept=kept))
 
     def metrics(self) -> dict[str, float]:
         """Number of subgoals, and when each was found (0: the slot is free)."""

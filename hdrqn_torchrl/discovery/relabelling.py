@@ -14,7 +14,8 @@ def relabel(steps: TensorDictBase, table: SubgoalTable, *, newest: int, kept: Te
     """Rewrites, in place, which subgoals stored steps attained and could choose, as the environment would have.
 
     The steps in which an episode begins may have been overwritten; then what it had spent is read from its oldest step
-    that is left. A subgoal that has another meaning now was not pursued in old steps; they count as exploring.
+    that is left. A subgoal that has another meaning now was not pursued in old steps; they count as exploring, where
+    what was pursued is stored as such.
 
     Args:
         steps: a ring of steps ``[rows, N]`` with their ``events``.
@@ -31,10 +32,10 @@ def relabel(steps: TensorDictBase, table: SubgoalTable, *, newest: int, kept: Te
     mask = steps.get(keys.SUBGOAL_MASK)
     oldest = ~mask[order[0]] & ~steps.get(keys.IS_INIT)[order[0]] & kept  # [N, G]: spent already
     spent = before | ((episode == episode[0]).unsqueeze(-1) & oldest)
-    active = after.get(keys.ACTIVE_SUBGOAL)
     mask[order] = table.available(spent)
     after.get(keys.ATTAINED)[order] = attained
-    active.masked_fill_(~kept[active], EXPLORE)
+    if (active := after.get(keys.ACTIVE_SUBGOAL, None)) is not None:
+        active.masked_fill_(~kept[active], EXPLORE)
 
 
 def _attained_before(attained: Tensor, begins: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from helpers import build, make_collector, small_env, tiny_settings
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import ExcludeTransform
 
-from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
 from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.evaluation import evaluate
@@ -19,11 +19,12 @@ from hdrqn_torchrl.runs.weights import load_weights, save_weights
 PRIVILEGED = ("attained", "success")  # all that the small room says besides
 
 
-def make_agent(env, seed=0, **settings):
+def make_agent(env, seed=0, name="v3", **settings):
     torch.manual_seed(seed)
     discovery = HandGiven(max_subgoals=2, **({"warmup_frames": 1, "discovery_frames": 64} | settings))
     learner = tiny_settings(slice_len=7)
-    return build("v3", env, settings=learner, subgoals="discovered", discovery=discovery)
+    options = {} if name == "v3" else {"sub_hindsight": True}
+    return build(name, env, settings=learner, subgoals="discovered", discovery=discovery, **options)
 
 
 def trained(agent, env, batches=10):
@@ -45,11 +46,12 @@ def bare_env(num_envs=4, **settings):
     return TransformedEnv(base, ExcludeTransform(*PRIVILEGED))
 
 
-def test_an_agent_that_finds_its_subgoals_reads_nothing_that_the_environment_says_about_them():
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_an_agent_that_finds_its_subgoals_reads_nothing_that_the_environment_says_about_them(name):
     full, bare = small_env(), bare_env()
     assert set(bare.observation_spec.keys()) == {"observation", "hazard"}
-    (one, _), (other, batch) = trained(make_agent(full), full), trained(make_agent(bare), bare)
-    assert batch["next", "attained"].any() and other.learners["joint"].updates > 5
+    (one, _), (other, batch) = (trained(make_agent(env, name=name), env) for env in (full, bare))
+    assert batch["next", "attained"].any() and all(learner.updates > 2 for learner in other.learners.values())
     weights = one.policy.state_dict()
     assert all(torch.equal(value, weights[name]) for name, value in other.policy.state_dict().items())
     greedy = evaluate(other.transform(bare_env()), other.policy, episodes=4)
@@ -111,6 +113,11 @@ def test_the_book_takes_only_subgoals_that_are_available():
 def test_what_does_not_go_with_discovery_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
         make_v3(small_env(), compact_network(), **options)
+
+
+def test_v2_finds_subgoals_only_if_it_learns_them_by_relabelling():
+    with pytest.raises(ValueError, match="sub_hindsight must be True with subgoals='discovered', got False"):
+        make_hdrqn(small_env(), compact_network(), subgoals="discovered")
 
 
 @pytest.mark.slow

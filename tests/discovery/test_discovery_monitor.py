@@ -12,12 +12,13 @@ from hdrqn_torchrl.discovery import Chosen
 FRAMES = 32  # of a batch: four worlds, eight steps
 
 
-def agent_and_batches(batches=8, learner=None, **settings):
+def agent_and_batches(batches=8, learner=None, name="v3", **settings):
     """An agent that has seen nothing yet, and what it goes on to see."""
     env = small_env()
     discovery = HandGiven(max_subgoals=2, **({"warmup_frames": 1, "discovery_frames": 64} | settings))
     settings = tiny_settings(slice_len=7, **(learner or {}))
-    agent = build("v3", env, settings=settings, subgoals="discovered", discovery=discovery)
+    options = {} if name == "v3" else {"sub_hindsight": True}
+    agent = build(name, env, settings=settings, subgoals="discovered", discovery=discovery, **options)
     return agent, islice(make_collector(agent, env, 8), batches)
 
 
@@ -54,6 +55,21 @@ def test_stored_steps_are_told_anew_and_minibatches_drawn_before_are_forgotten()
         stored["next", "attained"].any(-1), (stored["next", "events"] > 0).any(-1)
     )
     assert stored["next", "attained"].any() and stored["subgoal_mask"][..., 1:].any()
+
+
+def test_v2_relabels_steps_and_forgets_options_whose_subgoal_has_another_meaning_now():
+    agent, batches = agent_and_batches(6, name="v2", chosen=(Chosen({1: 1}), BOTH_GOALS, Chosen({2: 1})))
+    stored = {name: [] for name in agent.learners}
+    for batch in batches:
+        agent.observe(batch)
+        for name, learner in agent.learners.items():
+            stored[name].append(len(learner.buffer))
+            if len(stored["sub"]) == 4:  # the second goal is new
+                steps = agent.learners["sub"].buffer.storage[:]
+                assert torch.equal(steps["next", "attained"].any(-1), (steps["next", "events"] > 0).any(-1))
+                assert steps["subgoal_mask"][..., 2].any()
+    assert [rows // FRAMES for rows in stored["sub"]] == [0, 1, 2, 3, 4, 0]  # the first batch taught the detector
+    assert stored["meta"][0] == stored["meta"][5] == 0 < stored["meta"][4]
 
 
 def test_each_subgoal_reports_when_it_was_found():
