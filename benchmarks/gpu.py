@@ -95,7 +95,7 @@ def acting_speed(device: str, worlds: int, capture: bool, batches: int) -> float
 
 STUDY = {"algorithms": ("dqn", "drqn", "hdqn", "v1", "v2", "v3"), "seeds": 3, "frames": 1_000_000}
 """The paper's gridworld comparison: 20,000 episodes of 50 steps (conf/experiment/paper/gridworld.yaml)."""
-CHOICES = ((64, 8, 1), (256, 8, 1), (1_024, 8, 4), (4_096, 8, 16), (4_096, 2, 16), (16_384, 8, 64))
+CHOICES = ((64, 8, 1), (256, 8, 1), (1_024, 8, 4), (1_024, 8, 16), (4_096, 8, 16), (4_096, 2, 16), (16_384, 8, 64))
 """Worlds, steps of a batch, and times as large minibatches: the replay ratio is the same."""
 
 

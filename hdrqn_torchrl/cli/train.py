@@ -128,14 +128,23 @@ def tell(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 
-def never_updated(algorithm: Algorithm, total_frames: int) -> list[str]:
-    """A warning for each learner whose first update would come after the end of the training."""
-    return [
-        f"warning: total_frames={total_frames:,} must be above warmup_frames={learner.settings.warmup_frames:,} for "
-        f"the learner {name!r} to learn anything; use more frames or a shorter warmup"
-        for name, learner in algorithm.learners.items()
-        if total_frames <= learner.settings.warmup_frames
-    ]
+def late_learners(algorithm: Algorithm, total_frames: int) -> list[str]:
+    """A warning for each learner that a large part of a training is over for before it begins, or all of it."""
+    found = []
+    for name, learner in algorithm.learners.items():
+        warmup, first = learner.settings.warmup_frames, learner.first_update_at
+        if total_frames <= warmup:
+            found.append(
+                f"warning: total_frames={total_frames:,} must be above warmup_frames={warmup:,} for the learner "
+                f"{name!r} to learn anything; use more frames or a shorter warmup"
+            )
+        elif first > warmup and first > total_frames / 4:
+            found.append(
+                f"warning: env.num_envs should be smaller for total_frames={total_frames:,}, as the learner {name!r} "
+                f"learns nothing in the first {first:,} frames, in which all worlds play their first sequence; use "
+                "fewer worlds or more frames"
+            )
+    return found
 
 
 def tell_of_player(sentence: str) -> None:
@@ -234,7 +243,7 @@ def build_run(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvB
             f"evaluation.env must not change what the agent sees or does, got "
             f"{config.evaluation.env}: {found}; set env.KEY for both."
         )
-    for sentence in never_updated(algorithm, config.total_frames):
+    for sentence in late_learners(algorithm, config.total_frames):
         tell(sentence)
     evaluation_env = algorithm.transform(evaluation_base)
     chosen = config.evaluation

@@ -104,6 +104,9 @@ class Learner:
         )
         self._captured = Captured(self._gradient_step) if captures else None
         self._sequence_len = (settings.slice_len or 0) + getattr(loss, "lookahead", 0)
+        first_sequence = (num_envs or 0) * self._sequence_len if settings.sampling == "episode_starts" else 0
+        self.first_update_at = max(settings.warmup_frames, first_sequence)
+        """Frames without updates at the beginning: all worlds play the first sequence at the same time."""
         draws = captures and not (refresh is not None and refresh_reads)
         self._draws = (
             DeviceDraws(self.buffer, sequences=settings.batch_size, length=self._sequence_len) if draws else None

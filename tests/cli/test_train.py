@@ -22,7 +22,7 @@ from processes import leftovers, limit_file_size, limited_file_size, run_script,
 from programs import CONF, ROOT, TINY, TINY_HDRQN, call
 from safetensors.torch import load_file
 
-from hdrqn_torchrl.algorithms import make_hdrqn
+from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
 from hdrqn_torchrl.cli import train
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.learning import Learner, LearnerSettings
@@ -180,11 +180,25 @@ class TestMessages:
 
 def test_a_training_that_ends_before_a_learner_begins_is_warned_of():
     agent = make_hdrqn(small_env(), compact_network(8, (8,)), meta=LearnerSettings(warmup_frames=9_000))
-    assert train.never_updated(agent, 9_001) == []
-    assert train.never_updated(agent, 9_000) == [
+    assert train.late_learners(agent, 9_001) == []
+    assert train.late_learners(agent, 9_000) == [
         "warning: total_frames=9,000 must be above warmup_frames=9,000 for the learner 'meta' to learn anything; use "
         "more frames or a shorter warmup"
     ]
+
+
+def test_worlds_of_which_most_of_a_training_sees_the_first_sequence_only_are_warned_of():
+    env = small_env(64, max_steps=10)
+    agent = make_v3(
+        env,
+        compact_network(8, (8,)),
+        learner=LearnerSettings(slice_len=10, sampling="episode_starts", warmup_frames=100),
+    )
+    assert agent.learners["joint"].first_update_at == 640 + 64 * agent.learners["joint"].loss.lookahead
+    first = agent.learners["joint"].first_update_at
+    assert train.late_learners(agent, 4 * first) == []
+    (sentence,) = train.late_learners(agent, 4 * first - 1)
+    assert f"learns nothing in the first {first:,} frames" in sentence and "use fewer worlds or more frames" in sentence
 
 
 @pytest.mark.parametrize("question", [["--help"], ["--cfg", "job"], ["--cfg", "job", "algo=drqn"]], ids=" ".join)
