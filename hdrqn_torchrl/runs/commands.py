@@ -9,7 +9,7 @@ from pathlib import Path
 
 import hdrqn_torchrl
 
-PROGRAMS = ("train", "evaluate", "watch", "export", "plot", "report", "check")
+PROGRAMS = ("train", "evaluate", "watch", "export", "plot", "report", "check", "zoo")
 _SCRIPT = re.compile(rf"python ({'|'.join(PROGRAMS)})\.py")
 _TOP = Path(hdrqn_torchrl.__file__).parent.parent
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 
+from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.durable import sync
 from hdrqn_torchrl.runs.files import replaced
@@ -20,12 +22,16 @@ def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None
 
     Args:
         policy: built with the settings of the run.
-        directory: the run's folder of checkpoints.
+        directory: the run's folder of checkpoints; if it is not there, the run's weights beside it are loaded.
         which: ``"best"``, ``"last"``, or the path of a checkpoint or of a file of :func:`save_weights`.
 
     Raises:
         ValueError: if there is none, it is damaged, or it does not fit.
     """
+    alone = directory.with_name(layout.WEIGHTS)
+    if which in ("best", "last") and not directory.exists() and alone.is_file():
+        load_weights(policy, alone)
+        return
     checkpoints = Checkpoints(directory)
     try:
         path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
@@ -39,10 +45,18 @@ def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None
         raise ValueError(f"checkpoint can't be loaded: {error}") from error
 
 
-def save_weights(module: nn.Module, path: Path) -> None:
-    """Writes a module's parameters and buffers to ``path``, which is either the whole file or the one before."""
+def save_weights(module: nn.Module, path: Path, *, half: bool = False) -> None:
+    """Writes a module's parameters and buffers to ``path``, which is either the whole file or the one before.
+
+    Args:
+        module: whose state is written.
+        path: the file.
+        half: whether numbers of 32 bits are rounded to 16; they are loaded as 32 bits again.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     weights = {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
+    if half:
+        weights = {name: value.half() if value.dtype == torch.float32 else value for name, value in weights.items()}
     with replaced(path) as partial:
         save_file(weights, partial)
     sync(path.parent)

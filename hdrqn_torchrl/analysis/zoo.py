@@ -1,0 +1,120 @@
+"""Agents that come trained: folders of settings, weights and a card with what they achieve.
+
+Such a folder is read like that of a run: ``load_agent``, ``evaluate``, ``watch`` and ``export`` take it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hdrqn_torchrl.analysis.episodes import summarise
+from hdrqn_torchrl.runs import Agent, layout, load_agent, play, save_weights
+from hdrqn_torchrl.runs.cards import Card
+from hdrqn_torchrl.runs.files import read_json, write_whole
+from hdrqn_torchrl.runs.stored_settings import read_settings
+
+WORLDS = 50
+"""Played at the same time."""
+_OWN = ("hydra.", "output_root=", "resume=", "init_from=", "logger=", "collector.address=", "seeds=", "threads=")
+"""Overrides of a command that only say where and how it ran."""
+_FIGURES = ("return_mean", "success_rate", "steps_mean")
+
+
+def score(agent: Agent, *, episodes: int, seed: int) -> dict[str, Any]:
+    """What an agent achieves in greedy episodes (:func:`~hdrqn_torchrl.analysis.episodes.summarise`)."""
+    limit = agent.config.evaluation.max_steps
+    played = play(agent.env, agent.algorithm.policy, episodes=episodes, seed=seed, max_steps=limit)
+    return summarise(played)
+
+
+def disagreement(card: Card, scored: dict[str, Any]) -> list[str]:
+    """Figures that differ from a card by more than four standard errors of both samples.
+
+    Args:
+        card: of the agent.
+        scored: what :func:`score` found.
+    """
+    found = []
+    for name, value in card.figures.items():
+        interval = card.intervals[name]
+        half_width = 0.01 * abs(value) if interval is None else max(abs(bound - value) for bound in interval)
+        margin = 2 * half_width * (1 + math.sqrt(card.episodes / scored["episodes"]))
+        if abs(scored[name] - value) > margin:
+            found.append(f"{name} must be {value:.3f} within {margin:.3f}, got {scored[name]:.3f}")
+    return found
+
+
+def add_agent(run: Path, zoo: Path, name: str, *, episodes: int = 500, allowed_targets: Sequence[str] = ()) -> Card:
+    """Makes an agent of a run.
+
+    Weights are rounded to 16 bits if the greedy figures in the same worlds then stay within the intervals of those of
+    the run's own weights.
+
+    Args:
+        run: run folder.
+        zoo: folder of agents.
+        name: of the new one; an old one of this name is replaced.
+        episodes: greedy episodes of its figures.
+        allowed_targets: builders of your own that the run may name.
+    """
+    agent = load_agent(run, num_envs=WORLDS, allowed_targets=allowed_targets)
+    seed = agent.config.evaluation.seed + 1
+    full = score(agent, episodes=episodes, seed=seed)
+    folder = zoo / name
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_settings(run, folder)
+    for half in (True, False):
+        save_weights(agent.algorithm.policy, folder / layout.WEIGHTS, half=half)
+        again = load_agent(folder, num_envs=WORLDS, allowed_targets=allowed_targets)
+        scored = score(again, episodes=episodes, seed=seed)
+        if all(_within(full, scored, figure) for figure in _FIGURES if figure in full):
+            break
+    card = _make_card(run, agent, name, half, seed, scored)
+    write_whole(folder / layout.CARD, json.dumps(asdict(card), indent=2) + "\n")
+    return card
+
+
+def _within(full: dict[str, Any], scored: dict[str, Any], figure: str) -> bool:
+    low, high = full["intervals"][figure] or (full[figure], full[figure])
+    return low <= scored[figure] <= high
+
+
+def _write_settings(run: Path, folder: Path) -> None:
+    """The run's settings without what is of the machine it ran on."""
+    settings = read_settings(run / layout.CONFIG)
+    settings |= {"output_root": "outputs", "resume": None, "init_from": None, "device": "auto", "threads": 1}
+    settings |= {"collector": {"kind": "local"}, "logger": {"loggers": []}}
+    write_whole(folder / layout.CONFIG, yaml.safe_dump(settings, sort_keys=False))
+
+
+def _make_card(run: Path, agent: Agent, name: str, half: bool, seed: int, scored: dict[str, Any]) -> Card:
+    origin, summary = read_json(run / layout.ORIGIN), read_json(run / layout.SUMMARY)
+    env, choices = agent.config.env, origin.get("choices", {})
+    overrides = [each for each in origin.get("overrides", []) if not each.startswith(_OWN)]
+    figures = [figure for figure in _FIGURES if figure in scored]
+    return Card(
+        name=name,
+        task=str(env.get("id") or choices.get("env")),
+        algo=str(choices.get("algo")),
+        command=shlex.join(["hdrqn", "train", *overrides]),
+        commit=str(origin.get("commit")),
+        seed=agent.config.seed,
+        frames=int(summary["frames"]),
+        half=half,
+        episodes=scored["episodes"],
+        worlds_seed=seed,
+        figures={figure: round(scored[figure], 4) for figure in figures},
+        intervals={figure: _rounded(scored["intervals"][figure]) for figure in figures},
+    )
+
+
+def _rounded(interval: list[float] | None) -> list[float] | None:
+    return None if interval is None else [round(bound, 4) for bound in interval]

@@ -1,0 +1,115 @@
+"""zoo.py: an agent made of a run, shown, copied, played."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from run_folders import write_run
+from safetensors.torch import load_file
+
+from hdrqn_torchrl.analysis.zoo import disagreement, score
+from hdrqn_torchrl.cli import watch, zoo
+from hdrqn_torchrl.cli.zoo import as_settings
+from hdrqn_torchrl.runs import load_agent
+from hdrqn_torchrl.runs.cards import cards_of
+
+
+def call(*arguments):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["zoo.py", *map(str, arguments)])
+        zoo.main()
+
+
+@pytest.fixture(scope="module")
+def agents(tmp_path_factory):
+    """A zoo with one agent, made of a run in a folder of its own."""
+    folder = tmp_path_factory.mktemp("zoo")
+    run = folder / "run"
+    run.mkdir()
+    write_run(run)
+    overrides = ["env=gridworld", "algo=v2", f"hydra.run.dir={run}", "logger=csv", "seed=3"]
+    origin = {"choices": {"env": "gridworld", "algo": "v2"}, "overrides": overrides, "commit": "abc"}
+    (run / "run.json").write_text(json.dumps(origin))
+    (run / "summary.json").write_text(json.dumps({"frames": 200}))
+    call("add", "small-v2", f"run={run}", f"zoo={folder / 'zoo'}", "episodes=50")
+    return folder / "zoo"
+
+
+def test_a_card_says_what_an_agent_is_and_what_it_achieves(agents):
+    (card,) = cards_of(agents)
+    assert (card.name, card.task, card.algo, card.frames, card.episodes) == ("small-v2", "gridworld", "v2", 200, 50)
+    assert card.command == "hdrqn train env=gridworld algo=v2 seed=3" and card.commit == "abc"
+    assert set(card.figures) == {"return_mean", "success_rate", "steps_mean"} == set(card.intervals)
+
+
+def test_an_agent_is_a_run_with_weights_of_16_bits_in_place_of_checkpoints(agents):
+    assert {path.name for path in (agents / "small-v2").iterdir()} == {
+        "card.json",
+        "config.yaml",
+        "weights.safetensors",
+    }
+    stored = load_file(agents / "small-v2/weights.safetensors")
+    assert {value.dtype for value in stored.values()} == {torch.float16, torch.int64}
+    policy = load_agent(agents / "small-v2").algorithm.policy
+    assert all(value.dtype == torch.float32 for value in policy.parameters())
+    assert all(torch.equal(value, stored[name].to(value.dtype)) for name, value in policy.state_dict().items())
+
+
+def test_settings_of_an_agent_say_nothing_of_the_machine_that_it_was_trained_on(agents):
+    assert (
+        str(agents.parent)
+        not in (agents / "small-v2/config.yaml").read_text() + (agents / "small-v2/card.json").read_text()
+    )
+
+
+def test_a_score_agrees_with_the_card_unless_it_is_of_another_agent(agents):
+    (card,) = cards_of(agents)
+    agent = load_agent(agents / "small-v2", num_envs=20)
+    scored = score(agent, episodes=20, seed=card.worlds_seed)
+    assert disagreement(card, scored) == []
+    wrong = disagreement(card, scored | {"steps_mean": 0.0})
+    assert len(wrong) == 1 and wrong[0].startswith("steps_mean must be ")
+
+
+def test_agents_are_listed_and_copied(agents, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    call("list", f"zoo={agents}")
+    call("get", "small-v2", f"zoo={agents}", "out=mine")
+    listed, evaluation = capsys.readouterr().out.splitlines()
+    assert listed.startswith("small-v2 ") and "gridworld" in listed and "return " in listed
+    assert evaluation.endswith("run=mine episodes=100") and load_agent("mine").config.env["view"] == 3
+
+
+def test_an_agent_is_played_as_a_run_is(agents, monkeypatch):
+    seen = []
+    monkeypatch.setattr(watch, "run", seen.append)
+    call("watch", "small-v2", f"zoo={agents}", "episodes=1", "seed=4", "out=a.mp4", "allowed_targets=[mine.Env]")
+    played = watch.Settings(run=str(agents / "small-v2"), out="a.mp4", episodes=1, seed=4, allowed_targets=["mine.Env"])
+    assert seen == [played]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["bark"], r"action must be one of list, get, watch, add, got 'bark'"),
+        (["get", "nobody"], r"name must be one of small-v2, got nobody"),
+        (["watch"], r"name must be one of small-v2, got None"),
+        (["add", "new"], r"run and name must be given"),
+        (["add", "new", "run=nowhere"], r"run must be that of a finished training, got nowhere"),
+    ],
+)
+def test_mistakes_are_told(agents, arguments, message):
+    with pytest.raises(SystemExit, match=message):
+        call(*arguments, f"zoo={agents}")
+
+
+def test_a_folder_without_agents_is_refused(tmp_path):
+    with pytest.raises(SystemExit, match=r"zoo must be a folder of trained agents, got .*; a checkout has one"):
+        call("list", f"zoo={tmp_path}")
+
+
+def test_a_name_needs_no_key():
+    assert as_settings(["add", "run=a", "b"]) == ["action=add", "name=b", "run=a"]
+    assert as_settings(["--help"]) == ["--help"] and Path(zoo.FOLDER).name == "zoo"
