@@ -5,7 +5,7 @@ ARGS ?=
 # Processes that `make test` shares the tests among, 2 GB each. Plain `pytest -m 'not slow'` does without.
 WORKERS ?= 2
 
-.PHONY: setup train test test-slow test-gpu lint examples clean
+.PHONY: setup train test test-slow test-gpu lint examples docs clean
 
 setup: .venv/.ready
 
@@ -39,5 +39,16 @@ examples: setup
 	$(BIN)/python examples/reuse_loss.py --updates 60
 	$(BIN)/python examples/own_task/door_key.py --frames 512 --out $$(mktemp -d)/door_key
 
+# The site, in docs/_build/html: notebooks run, warnings are errors, links inside are checked.
+docs: .venv/.docs
+	rm -rf docs/_build docs/api/generated
+	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
+.venv/.docs: .venv/.ready
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	touch $@
+
 clean:
+	rm -rf docs/_build docs/api/generated
 	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -21,20 +21,21 @@ from run_folders import write_run
 from hdrqn_torchrl.algorithms import make_v3
 from hdrqn_torchrl.cli.check import composed
 from hdrqn_torchrl.cli.command_line import command_line
+from hdrqn_torchrl.cli.zoo import as_settings
 from hdrqn_torchrl.envs import check_task
 from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.commands import PROGRAMS
 
 ROOT = Path(__file__).parents[1]
-README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+README, PARTS = ROOT / "README.md", ROOT / "docs/parts.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md")), *sorted((ROOT / "docs/tutorials").glob("*.md"))]
 SHORTER = {
     "total_frames = 150_000": "total_frames = 2_048",  # before the first update is due
     "num_envs=250": "num_envs=4",
     "episodes=250": "episodes=4",
 }
-"""Replacements in Python blocks, so that they take seconds; test_learning.py runs the README's unchanged."""
+"""Replacements in Python blocks, so that they take seconds; test_learning.py runs that of docs/parts.md unchanged."""
 
 RUN = "outputs/gridworld-v2/2026-11-22_16-04-11-seed0"
 """The run folder that the pages name."""
@@ -133,6 +134,7 @@ def test_commands_have_settings_that_exist(page, monkeypatch):
                     check_training(without_seed(job), folder)
         else:
             seen: list = []
+            arguments = as_settings(arguments) if program == "zoo" else arguments
             monkeypatch.setattr(sys, "argv", [f"{program}.py", *arguments])
             command_line(import_module(f"hdrqn_torchrl.cli.{program}").Settings, "", seen.append)
             assert seen or arguments == ["--help"]

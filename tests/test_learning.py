@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 from helpers import build, make_collector, small_env, tiny_settings
-from test_docs import README, python_blocks
+from test_docs import PARTS, python_blocks
 from torchrl.envs import ExplorationType
 
 from hdrqn_torchrl.algorithms import make_hdrqn, make_v3, presets
@@ -124,9 +124,9 @@ def test_agents_learn_to_reach_two_goals_in_order(make, frames, threshold):
 
 
 @pytest.mark.slow
-def test_the_readme_s_training_learns(capsys):
+def test_the_training_of_the_page_on_parts_learns(capsys):
     """Unchanged; a random agent's return is about 0.1."""
-    exec(python_blocks(README)[0], {"__name__": "readme"})
+    exec(python_blocks(PARTS)[0], {"__name__": "parts"})
     assert float(capsys.readouterr().out.split()[-1]) > 0.6
 
 

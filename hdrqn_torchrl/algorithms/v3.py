@@ -101,8 +101,8 @@ def make_v3(
             optimiser.
         meta_learning_rate: learning rate of that optimiser, with the same schedule; ``None``:
             ``learner.learning_rate``.
-        sub_gamma, meta_gamma, middle_gamma, trace_decay, all_subgoals, intra_option, hazard_reward, bonus_reward,
-            prediction_weight: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        sub_gamma, meta_gamma, middle_gamma, trace_decay: see :class:`~hdrqn_torchrl.objectives.AllSubgoalsLoss`.
+        all_subgoals, intra_option, hazard_reward, bonus_reward, prediction_weight: see there, too.
         wrong_subgoal_reward: reward of the levels below the top for attaining a subgoal other than the one pursued; one
             number for the farthest set, or one for each set from near to far. A penalty keeps the agent from collecting
             too early what it needs later (the grid tasks have -0.5). If one subgoal is needed for another, such as the

@@ -1,4 +1,4 @@
-"""What one level of hDRQNv3 learns from each step of a sequence: the rule of :mod:`.all_subgoals`, level by level.
+"""What one level of hDRQNv3 learns from each step of a sequence: the rule of its loss, level by level.
 
 Shapes: ``B`` sequences of ``T`` steps and one more, which only serves to evaluate the step before; ``C`` subgoals that
 the level can be given, ``X`` choices that it has. At level 0 only the action taken has a column.

@@ -60,8 +60,8 @@ class SubgoalTransform(Transform):
         done_key, terminated_key: end of the episode.
         attained_key: which subgoals a step attained.
         subgoal_key: the policy's proposal.
-        option_init_key, active_subgoal_key, subgoal_mask_key, option_steps_key, option_return_key,
-            subgoal_reached_key, option_done_key, option_terminated_key, intrinsic_reward_key: entries written.
+        option_init_key, active_subgoal_key, subgoal_mask_key, option_steps_key, option_return_key: the book.
+        subgoal_reached_key, option_done_key, option_terminated_key, intrinsic_reward_key: the critic's verdict.
 
     Raises:
         ValueError: if a number breaks its rule, or the environment does not write what is read.

@@ -45,7 +45,7 @@ def ceiling(
 
 
 def standard_tasks() -> Iterator[StandardTask]:
-    """Every row of :data:`~hdrqn_torchrl.envs.grid.measured.MEASURED`."""
+    """Every row of ``MEASURED`` (measured.py)."""
     for layout, num_goals, max_steps in (
         ("open", 2, 50),
         ("open", 3, 50),

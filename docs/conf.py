@@ -1,0 +1,95 @@
+"""How Sphinx builds the site: ``make docs``. The network is not needed; notebooks are executed."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the notebooks' kernels, too
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # notebooks call `hdrqn`
+
+import hdrqn_torchrl
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "hdrqn_torchrl"
+
+project = PACKAGE
+author = "The hdrqn_torchrl authors"
+version = release = hdrqn_torchrl.__version__
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "_templates"]
+templates_path = ["_templates"]
+
+html_theme = "furo"
+html_title = PACKAGE
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_show_sourcelink = False
+
+myst_enable_extensions = ["dollarmath", "attrs_inline", "colon_fence"]
+myst_heading_anchors = 4
+nb_execution_mode = "auto"  # a notebook that holds outputs is left as it is
+nb_execution_timeout = 120
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_merge_streams = True
+
+autosummary_generate = True
+autosummary_imported_members = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # Args: have them in words, with shapes and units
+autodoc_class_signature = "mixed"
+autodoc_preserve_defaults = True
+napoleon_numpy_docstring = False
+napoleon_use_rtype = False
+napoleon_use_ivar = True
+nitpick_ignore_regex = [(r"py:.*", rf"(?!{PACKAGE}).*|.*\._.*")]  # what other packages document is not looked up
+
+
+def packages_above(module: str) -> list[Any]:
+    """The packages that a module lies in."""
+    parts = module.split(".")
+    return [import_module(".".join(parts[:end])) for end in range(2, len(parts))]
+
+
+def skip_exported(app: Any, what: str, name: str, thing: Any, skip: bool, options: Any) -> bool | None:
+    """Documents a thing once: on the page of the package that exports it, not on that of its module too."""
+    page = app.env.current_document.autodoc_module or ""
+    if what != "module" or not page.startswith(PACKAGE):
+        return None
+    return True if any(vars(package).get(name) is thing for package in packages_above(page)) else None
+
+
+def find_exported(app: Any, env: Any, node: Any, content: Any) -> Any:
+    """Finds ``hdrqn_torchrl.runs.trainer.Trainer`` on the page of ``hdrqn_torchrl.runs``, which exports it."""
+    parts, domain = node.get("reftarget", "").split("."), env.domains.python_domain
+    ends = [(start, end) for start in range(2, len(parts)) for end in range(start + 1, len(parts))]
+    shorter = [".".join(parts[:start] + parts[end:]) for start, end in ends]
+    for target in shorter if parts[0] == PACKAGE and node.get("refdomain") == "py" else ():
+        if target in domain.objects:
+            return domain.resolve_xref(env, node["refdoc"], app.builder, node["reftype"], target, node, content)
+    return None
+
+
+OUTSIDE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+([^)#]+)\)")
+"""Links of a page to what is no part of the site: the names of files of the checkout."""
+
+
+def prepare(app: Any, page: str, source: list[str]) -> None:
+    """The same files are read on a forge, too, where links lead to other files and the changelog has its own place."""
+    if page == "changelog":
+        source[0] = (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "](")
+        source[0] = re.sub(r"\[([^\]]+)\]\((examples|benchmarks)/[^)]*\)", r"`\1`", source[0])
+    source[0] = OUTSIDE.sub(r"`\2`", source[0])
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("autodoc-skip-member", skip_exported)
+    app.connect("missing-reference", find_exported)
+    app.connect("source-read", prepare)
