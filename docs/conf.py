@@ -13,6 +13,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the notebooks' kernels, too
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"  # notebooks call `hdrqn`
 
+from docutils import nodes
+from docutils.utils.math.latex2mathml import tex2mathml
+
 import hdrqn_torchrl
 
 ROOT = Path(__file__).parents[1]
@@ -21,11 +24,12 @@ PACKAGE = "hdrqn_torchrl"
 project = PACKAGE
 author = "The hdrqn_torchrl authors"
 version = release = hdrqn_torchrl.__version__
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 exclude_patterns = ["_build", "_templates"]
 templates_path = ["_templates"]
 
 html_theme = "furo"
+html_math_renderer = "mathml"  # which browsers draw without a script
 html_title = PACKAGE
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
@@ -38,6 +42,7 @@ nb_execution_timeout = 120
 nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_merge_streams = True
+nb_output_stderr = "remove"  # warnings, with paths of the machine
 
 autosummary_generate = True
 autosummary_imported_members = False
@@ -88,8 +93,17 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
     source[0] = OUTSIDE.sub(r"`\2`", source[0])
 
 
+def write_math(translator: Any, node: Any) -> None:
+    """Writes a formula as MathML, a displayed one on a line of its own."""
+    displayed = isinstance(node, nodes.math_block)
+    formula = tex2mathml(node.astext(), as_block=displayed)
+    translator.body.append(f'<div class="math">{formula}</div>' if displayed else formula)
+    raise nodes.SkipNode
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    app.add_html_math_renderer("mathml", (write_math, None), (write_math, None))
     app.connect("autodoc-skip-member", skip_exported)
     app.connect("missing-reference", find_exported)
     app.connect("source-read", prepare)

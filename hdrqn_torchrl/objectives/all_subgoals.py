@@ -19,7 +19,7 @@ top level pursues the task. For every level, every c and every choice x that agr
 So every level learns from every step, not only from those at which its options begin. Without intra-option learning,
 levels above the first learn only from the first step of each option, with the rewards of the whole option (SMDP):
 
-.. math:: y = r_0 + \gamma r_1 + \dots + \gamma^k ((1 - \lambda') \max_{x'} Q(s_k, x') + \lambda' y_k)
+.. math:: y = r_0 + \gamma r_1 + \ldots + \gamma^k ((1 - \lambda') \max_{x'} Q(s_k, x') + \lambda' y_k)
 
 with :math:`\lambda'` = lambda if the next subgoal is the greedy one, else 0.
 

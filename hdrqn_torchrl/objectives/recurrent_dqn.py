@@ -33,7 +33,7 @@ class RecurrentDQNLoss(SequenceLoss):
     .. math:: y_t = r_t + \gamma^{k_t} Q'(x_{t+1}, \arg\max_a Q(x_{t+1}, a)), \qquad
               L = \text{mean}_t\,(y_t - Q(x_t, a_t))^2
 
-    Online and target network are each unrolled once over the T + 1 inputs :math:`x_0 \dots x_T`, from the zero
+    Online and target network are each unrolled once over the T + 1 inputs :math:`x_0 \ldots x_T`, from the zero
     state or from a stored one (``state_keys``), so that both see the same context. TorchRL's ``DQNLoss`` unrolls three
     times over T, starts its targets one step late and lets the state run across the slices of a flat batch, hence
     this loss.

@@ -28,7 +28,7 @@ class SubgoalTransform(Transform):
     2. the critic: ``subgoal_reached`` :math:`=` ``attained``:math:`[g]`;
     3. :math:`r^{in} =` ``reached_reward`` if reached, plus ``hazard_reward`` if the hazard was met, plus
        ``wrong_subgoal_reward`` if another subgoal was attained;
-    4. ``option_return`` :math:`\mathrel{+}= \gamma^{k} r^{ex}`, ``option_steps`` :math:`= k + 1`;
+    4. ``option_return`` grows by :math:`\gamma^{k} r^{ex}`, ``option_steps`` :math:`= k + 1`;
     5. ``option_done`` = reached, or the episode is done, or ``max_option_steps`` are over, or :math:`g` can no
        longer be chosen, or the option of the level above is done; ``option_terminated`` = reached or the episode
        terminated.
