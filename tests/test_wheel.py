@@ -110,7 +110,7 @@ def test_errors_of_the_installed_command_say_what_to_type(installed):
 def test_the_installed_command_prints_version_and_programs(installed):
     hdrqn = str(installed / "bin" / "hdrqn")
     assert run(hdrqn, "--version", folder=installed).stdout == f"{hdrqn_torchrl.__version__}\n"
-    assert "train|evaluate|watch|plot|report" in run(hdrqn, "--help", folder=installed).stdout
+    assert "train|evaluate|watch|export|plot|report|check|zoo" in run(hdrqn, "--help", folder=installed).stdout
 
 
 def test_the_wheel_holds_every_file_of_the_package_and_of_conf(installed):
