@@ -1,7 +1,7 @@
-# On a CPU: docker build -t hdrqn . && docker run --rm -v "$PWD/outputs:/work/outputs" hdrqn train env=gridworld algo=v3
+# On a CPU: docker build -t hdrqn . && docker run --rm -v "$PWD/outputs:/app/outputs" hdrqn train env=gridworld algo=v3
 FROM python:3.11-slim
 
-WORKDIR /work
+WORKDIR /app
 # PyTorch's own wheels for CPUs are a tenth of those with CUDA; the version is that of constraints.txt.
 COPY constraints.txt ./
 RUN grep -E '^torch==' constraints.txt > torch.txt \
