@@ -8,6 +8,8 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import shutil
+import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -65,20 +67,26 @@ def add_agent(run: Path, zoo: Path, name: str, *, episodes: int = 500, allowed_t
         episodes: greedy episodes of its figures.
         allowed_targets: builders of your own that the run may name.
     """
+    origin, summary = read_json(run / layout.ORIGIN), read_json(run / layout.SUMMARY)  # before minutes of play
     agent = load_agent(run, num_envs=WORLDS, allowed_targets=allowed_targets)
     seed = agent.config.evaluation.seed + 1
     full = score(agent, episodes=episodes, seed=seed)
-    folder = zoo / name
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_settings(run, folder)
-    for half in (True, False):
-        save_weights(agent.algorithm.policy, folder / layout.WEIGHTS, half=half)
-        again = load_agent(folder, num_envs=WORLDS, allowed_targets=allowed_targets)
-        scored = score(again, episodes=episodes, seed=seed)
-        if all(_within(full, scored, figure) for figure in _FIGURES if figure in full):
-            break
-    card = _make_card(run, agent, name, half, seed, scored)
-    write_whole(folder / layout.CARD, json.dumps(asdict(card), indent=2) + "\n")
+    zoo.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=zoo) as place:  # an old agent stays whole until the new one is
+        folder = Path(place) / name
+        folder.mkdir()
+        _write_settings(run, folder)
+        for half in (True, False):
+            save_weights(agent.algorithm.policy, folder / layout.WEIGHTS, half=half)
+            again = load_agent(folder, num_envs=WORLDS, allowed_targets=allowed_targets)
+            scored = score(again, episodes=episodes, seed=seed)
+            if all(_within(full, scored, figure) for figure in _FIGURES if figure in full):
+                break
+        card = _make_card(origin, summary, agent, name, half, seed, scored)
+        write_whole(folder / layout.CARD, json.dumps(asdict(card), indent=2) + "\n")
+        if (zoo / name).exists():
+            shutil.rmtree(zoo / name)
+        folder.rename(zoo / name)
     return card
 
 
@@ -95,8 +103,15 @@ def _write_settings(run: Path, folder: Path) -> None:
     write_whole(folder / layout.CONFIG, yaml.safe_dump(settings, sort_keys=False))
 
 
-def _make_card(run: Path, agent: Agent, name: str, half: bool, seed: int, scored: dict[str, Any]) -> Card:
-    origin, summary = read_json(run / layout.ORIGIN), read_json(run / layout.SUMMARY)
+def _make_card(
+    origin: dict[str, Any],
+    summary: dict[str, Any],
+    agent: Agent,
+    name: str,
+    half: bool,
+    seed: int,
+    scored: dict[str, Any],
+) -> Card:
     env, choices = agent.config.env, origin.get("choices", {})
     overrides = [each for each in origin.get("overrides", []) if not each.startswith(_OWN)]
     figures = [figure for figure in _FIGURES if figure in scored]

@@ -1,15 +1,17 @@
 """zoo.py: an agent made of a run, shown, copied, played."""
 
 import json
+import shutil
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import torch
 from run_folders import write_run
 from safetensors.torch import load_file
 
-from hdrqn_torchrl.analysis.zoo import disagreement, score
+from hdrqn_torchrl.analysis.zoo import add_agent, disagreement, score
 from hdrqn_torchrl.cli import watch, zoo
 from hdrqn_torchrl.cli.zoo import as_settings
 from hdrqn_torchrl.runs import load_agent
@@ -62,6 +64,27 @@ def test_settings_of_an_agent_say_nothing_of_the_machine_that_it_was_trained_on(
         str(agents.parent)
         not in (agents / "small-v2/config.yaml").read_text() + (agents / "small-v2/card.json").read_text()
     )
+
+
+def test_an_agent_stays_as_it_is_if_its_successor_comes_to_nothing(agents, tmp_path, monkeypatch):
+    zoo_folder, run = tmp_path / "zoo", tmp_path / "run"
+    shutil.copytree(agents, zoo_folder)
+    shutil.copytree(agents.parent / "run", run)
+    before = {path.name: path.read_bytes() for path in (zoo_folder / "small-v2").iterdir()}
+    monkeypatch.setattr("hdrqn_torchrl.analysis.zoo.score", interrupted := Mock(side_effect=RuntimeError))
+    with pytest.raises(RuntimeError):
+        add_agent(run, zoo_folder, "small-v2")
+    (run / "summary.json").unlink()
+    with pytest.raises(SystemExit, match="run must be that of a finished training"):
+        call("add", "small-v2", f"run={run}", f"zoo={zoo_folder}")
+    assert interrupted.call_count == 1
+    scores = [score(load_agent(agents / "small-v2", num_envs=2), episodes=2, seed=0), RuntimeError]
+    monkeypatch.setattr("hdrqn_torchrl.analysis.zoo.score", Mock(side_effect=scores))
+    shutil.copy(agents.parent / "run/summary.json", run)
+    with pytest.raises(RuntimeError):  # when new weights have been written
+        add_agent(run, zoo_folder, "small-v2")
+    assert {path.name: path.read_bytes() for path in (zoo_folder / "small-v2").iterdir()} == before
+    assert [path.name for path in zoo_folder.iterdir()] == ["small-v2"]
 
 
 def test_a_score_agrees_with_the_card_unless_it_is_of_another_agent(agents):
