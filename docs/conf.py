@@ -81,8 +81,8 @@ def find_exported(app: Any, env: Any, node: Any, content: Any) -> Any:
     return None
 
 
-OUTSIDE = re.compile(r"\[([^\]]+)\]\((?:\.\./)+([^)#]+)\)")
-"""Links of a page to what is no part of the site: the names of files of the checkout."""
+OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+([^)#]+)\)")
+"""Links of a page, not pictures, to what is no part of the site: the names of files of the checkout."""
 
 
 def prepare(app: Any, page: str, source: list[str]) -> None:

@@ -9,7 +9,7 @@ from hdrqn_torchrl.runs import commands, layout
 
 ORDER = (
     "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "discovery", "algorithms",
-    "runs", "export", "analysis", "rendering", "cli",
+    "runs", "export", "rendering", "analysis", "cli",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

@@ -1,4 +1,4 @@
-"""Agents that come trained: folders of settings, weights and a card with what they achieve.
+"""Agents that come trained: folders of settings, weights, a picture of play and a card with what they achieve.
 
 Such a folder is read like that of a run: ``load_agent``, ``evaluate``, ``watch`` and ``export`` take it.
 """
@@ -18,6 +18,7 @@ from typing import Any
 import yaml
 
 from hdrqn_torchrl.analysis.episodes import summarise
+from hdrqn_torchrl.rendering import excerpt, record_episodes, write_video
 from hdrqn_torchrl.runs import Agent, layout, load_agent, play, save_weights
 from hdrqn_torchrl.runs.cards import Card
 from hdrqn_torchrl.runs.files import read_json, write_whole
@@ -25,8 +26,13 @@ from hdrqn_torchrl.runs.stored_settings import read_settings
 
 WORLDS = 50
 """Played at the same time."""
-_OWN = ("hydra.", "output_root=", "resume=", "init_from=", "logger=", "collector.address=", "seeds=", "threads=")
-"""Overrides of a command that only say where and how it ran."""
+_OWN = (
+    "hydra", "sweep", "output_root", "resume", "resume_override", "init_from", "init_checkpoint", "logger",
+    "collector.address", "device", "seeds", "threads",
+)  # fmt: skip
+"""Settings of a command, with those below them, that only say where and how it ran."""
+EPISODES, FRAMES, WIDTH = 3, 40, 440
+"""Of ``play.gif``: episodes and frames at most, pixels."""
 _FIGURES = ("return_mean", "success_rate", "steps_mean")
 
 
@@ -82,12 +88,48 @@ def add_agent(run: Path, zoo: Path, name: str, *, episodes: int = 500, allowed_t
             scored = score(again, episodes=episodes, seed=seed)
             if all(_within(full, scored, figure) for figure in _FIGURES if figure in full):
                 break
+        write_play(folder, seed=seed, allowed_targets=allowed_targets)
         card = _make_card(origin, summary, agent, name, half, seed, scored)
         write_whole(folder / layout.CARD, json.dumps(asdict(card), indent=2) + "\n")
         if (zoo / name).exists():
             shutil.rmtree(zoo / name)
         folder.rename(zoo / name)
     return card
+
+
+def write_play(folder: Path, *, seed: int, allowed_targets: Sequence[str] = ()) -> None:
+    """Writes ``play.gif``: an agent's greedy play, as ``watch.py`` shows it, in few frames.
+
+    Args:
+        folder: of the agent.
+        seed: of the worlds.
+        allowed_targets: builders of your own that it may name.
+    """
+    agent = load_agent(folder, allowed_targets=allowed_targets)
+    limit = agent.config.evaluation.max_steps
+    frames = record_episodes(agent.env, agent.algorithm, episodes=EPISODES, seed=seed, max_steps=limit)
+    write_video(excerpt(frames, FRAMES), folder / layout.PLAY, width=WIDTH)
+
+
+def training_command(overrides: Sequence[str], *, seed: int) -> str:
+    """The command that trains an agent again: of each setting the last value, without what is of the machine.
+
+    Args:
+        overrides: those of the run, in order.
+        seed: of the run, which may be one of several that were trained together.
+
+    Examples:
+        >>> training_command(["env=gym", "tau=1", "logger=csv", "tau=2", "env.wrappers=[mine.A]", "seeds=0..3"], seed=2)
+        "hdrqn train env=gym tau=2 'env.wrappers=[mine.A]' seed=2"
+    """
+    last: dict[str, str] = {}
+    for override in overrides:
+        key = override.partition("=")[0]
+        last.pop(key, None)
+        if not any(key.lstrip("+~") == own or key.lstrip("+~").startswith((f"{own}.", f"{own}/")) for own in _OWN):
+            last[key] = override
+    last.setdefault("seed", f"seed={seed}")
+    return shlex.join(["hdrqn", "train", *last.values()])
 
 
 def _within(full: dict[str, Any], scored: dict[str, Any], figure: str) -> bool:
@@ -98,7 +140,8 @@ def _within(full: dict[str, Any], scored: dict[str, Any], figure: str) -> bool:
 def _write_settings(run: Path, folder: Path) -> None:
     """The run's settings without what is of the machine it ran on."""
     settings = read_settings(run / layout.CONFIG)
-    settings |= {"output_root": "outputs", "resume": None, "init_from": None, "device": "auto", "threads": 1}
+    settings |= {"output_root": "outputs", "resume": None, "resume_override": False, "init_from": None}
+    settings |= {"device": "auto", "threads": 1}
     settings |= {"collector": {"kind": "local"}, "logger": {"loggers": []}}
     write_whole(folder / layout.CONFIG, yaml.safe_dump(settings, sort_keys=False))
 
@@ -113,13 +156,12 @@ def _make_card(
     scored: dict[str, Any],
 ) -> Card:
     env, choices = agent.config.env, origin.get("choices", {})
-    overrides = [each for each in origin.get("overrides", []) if not each.startswith(_OWN)]
     figures = [figure for figure in _FIGURES if figure in scored]
     return Card(
         name=name,
         task=str(env.get("id") or choices.get("env")),
         algo=str(choices.get("algo")),
-        command=shlex.join(["hdrqn", "train", *overrides]),
+        command=training_command(origin.get("overrides", []), seed=agent.config.seed),
         commit=str(origin.get("commit")),
         seed=agent.config.seed,
         frames=int(summary["frames"]),

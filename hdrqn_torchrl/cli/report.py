@@ -17,7 +17,6 @@ python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_
 
 from __future__ import annotations
 
-import re
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,6 +35,7 @@ from hdrqn_torchrl.analysis.results import final_value
 from hdrqn_torchrl.cli.command_line import as_list, command_line
 from hdrqn_torchrl.cli.entries import common_references, note
 from hdrqn_torchrl.cli.findings import Found, Runs, read_runs, runs_of_jobs
+from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
@@ -252,20 +252,6 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
             )
             rows.append("| " + " | ".join(cells) + " |")
     return rows
-
-
-def put(text: str, mark: str, part: str) -> str:
-    """Replaces the text between a pair of marks, or adds text and marks at the end.
-
-    Examples:
-        >>> put("before <!-- a -->\\nold\\n<!-- end of a --> after", "a", "new")
-        'before <!-- a -->\\nnew\\n<!-- end of a --> after'
-    """
-    begin, end = f"<!-- {mark} -->", f"<!-- end of {mark} -->"
-    marked = f"{begin}\n{part}\n{end}"
-    if begin not in text:
-        return f"{text.rstrip()}\n\n{marked}\n"
-    return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: marked, text, flags=re.DOTALL)
 
 
 def main() -> None:

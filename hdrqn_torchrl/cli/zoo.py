@@ -1,16 +1,19 @@
-"""Agents that come trained: shows them, copies one, plays one, adds one.
+"""Agents that come trained: shows them, copies one, plays one, adds one, writes a page about them.
 
     python zoo.py list
     python zoo.py get NAME [out=FOLDER]
     python zoo.py watch NAME [out=episode.gif] [episodes=3] [seed=0]
     python zoo.py add NAME run=RUN_DIR [episodes=500]
+    python zoo.py page [out=docs/zoo.md]
 
 list    what there is: task, algorithm, greedy figures with 95 % intervals over episodes
 get     copies an agent to a folder of its own (default: its name), which evaluate, watch, export and init_from take as
         run=FOLDER, init_from=FOLDER/weights.safetensors
 watch   records episodes, as watch.py does; out=terminal shows them at once
 add     makes an agent of a run: its best weights (of 16 bits, if the greedy figures stay what they are), its settings,
-        and a card with the figures
+        play.gif, and a card with the figures
+page    writes the table of all agents, with their pictures, into a page, between marks (default: docs/zoo.md beside
+        the folder of the agents)
 
 zoo             folder of the agents (that of the checkout)
 allowed_targets builders of your own that an agent may name: [package.builder]
@@ -20,6 +23,7 @@ Nothing in such a folder can run code.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -28,12 +32,15 @@ from importlib import import_module
 from pathlib import Path
 
 from hdrqn_torchrl.cli.command_line import check_place, command_line
+from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.commands import as_called
 
-ACTIONS = ("list", "get", "watch", "add")
+ACTIONS = ("list", "get", "watch", "add", "page")
 FOLDER = Path(__file__).parents[2] / "zoo"
+MARK = "agents"
+"""Of the part of a page that ``page`` writes."""
 
 
 @dataclass
@@ -54,7 +61,7 @@ def run(settings: Settings) -> None:
     """Does what the action says."""
     if settings.action not in ACTIONS:
         raise SettingsError(f"action must be one of {', '.join(ACTIONS)}, got {settings.action!r}.")
-    {"list": show, "get": copy, "watch": watch, "add": add}[settings.action](settings)
+    {"list": show, "get": copy, "watch": watch, "add": add, "page": write_page}[settings.action](settings)
 
 
 def show(settings: Settings) -> None:
@@ -125,6 +132,21 @@ def add(settings: Settings) -> None:
         raise SettingsError(f"run must be that of a finished training, got {settings.run} ({error}).") from error
     size = (zoo / settings.name / layout.WEIGHTS).stat().st_size
     print(f"{card.name}: {size / 1000:.0f} kB, {'16' if card.half else '32'} bits, {card.figures}")
+    print(as_called("python zoo.py page") + "  # shows it in docs/zoo.md")
+
+
+def write_page(settings: Settings) -> None:
+    """Writes the part of a page that shows all agents."""
+    from hdrqn_torchrl.analysis.gallery import gallery
+    from hdrqn_torchrl.runs.cards import cards_of
+
+    zoo = Path(settings.zoo)
+    out = Path(settings.out or zoo.parent / "docs/zoo.md")
+    check_place(out, "out")
+    cards = cards_of(zoo)
+    text = out.read_text() if out.exists() else "# Agents that come trained\n\n## The agents\n"
+    out.write_text(put(text, MARK, gallery(cards, Path(os.path.relpath(zoo, out.parent)).as_posix())))
+    print(f"{out}: {', '.join(card.name for card in cards)}")
 
 
 def as_settings(arguments: Sequence[str]) -> list[str]:

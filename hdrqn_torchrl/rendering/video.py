@@ -43,13 +43,14 @@ def check_video(path: Path | None, *, fps: int) -> None:
         raise ValueError(f"fps must lie in [1, 50], got {fps}; use 4 to follow each step.")
 
 
-def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4) -> None:
+def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4, width: int = WIDTH) -> None:
     """Writes a GIF that loops forever, or an MP4 (H.264), which needs PyAV.
 
     Args:
         frames: what :func:`~hdrqn_torchrl.rendering.record_episodes` returned, at least one.
         path: file to write; its ending chooses the format.
         fps: steps per second.
+        width: of the pictures; less than 760 makes them and the file smaller.
 
     Raises:
         ValueError: see :func:`check_video`.
@@ -57,12 +58,12 @@ def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4) -> None:
     check_video(path, fps=fps)
     if not frames:
         raise ValueError("frames must hold at least one frame, got none; use record_episodes.")
-    _WRITERS[path.suffix.lower()](frames, path, fps)
+    _WRITERS[path.suffix.lower()](frames, path, fps, (width, 2 * round(width * HEIGHT / WIDTH / 2)))
 
 
-def _write_gif(frames: Sequence[Frame], path: Path, fps: int) -> None:
+def _write_gif(frames: Sequence[Frame], path: Path, fps: int, size: tuple[int, int]) -> None:
     palette, indices = _palette(frames)
-    images = (_with_palette(picture, palette, indices) for picture in _pictures(frames))
+    images = (_with_palette(picture, palette, indices) for picture in _pictures(frames, size))
     next(images).save(
         path,
         format="GIF",
@@ -74,13 +75,13 @@ def _write_gif(frames: Sequence[Frame], path: Path, fps: int) -> None:
     )
 
 
-def _write_mp4(frames: Sequence[Frame], path: Path, fps: int) -> None:
+def _write_mp4(frames: Sequence[Frame], path: Path, fps: int, size: tuple[int, int]) -> None:
     import av
 
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream("libx264", rate=fps)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for frame, picture in zip(frames, _pictures(frames), strict=True):
+        (stream.width, stream.height), stream.pix_fmt = size, "yuv420p"
+        for frame, picture in zip(frames, _pictures(frames, size), strict=True):
             for _ in range(hold(frame, fps)):
                 container.mux(stream.encode(av.VideoFrame.from_image(picture)))
         container.mux(stream.encode())
@@ -89,10 +90,11 @@ def _write_mp4(frames: Sequence[Frame], path: Path, fps: int) -> None:
 _WRITERS = {".gif": _write_gif, ".mp4": _write_mp4}
 
 
-def _pictures(frames: Sequence[Frame]) -> Iterator[Image.Image]:
+def _pictures(frames: Sequence[Frame], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Iterator[Image.Image]:
     """Draws the pictures one at a time, as all of them would fill the memory."""
     spans = bar_spans(frames)
-    return (Image.fromarray(draw_frame(frame, spans)) for frame in frames)
+    pictures = (Image.fromarray(draw_frame(frame, spans)) for frame in frames)
+    return (picture if picture.size == size else picture.resize(size, Image.Resampling.LANCZOS) for picture in pictures)
 
 
 def _palette(frames: Sequence[Frame]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:

@@ -23,6 +23,8 @@ WEIGHTS = "weights.safetensors"
 """Weights alone, in place of checkpoints: of agents that come trained (zoo/)."""
 CARD = "card.json"
 """What such an agent is, and what it achieves."""
+PLAY = "play.gif"
+"""How it plays."""
 EVALUATIONS = "evaluations"
 """What ``evaluate.py out=RUN_DIR/evaluations/NAME.json`` writes."""
 

@@ -1,6 +1,7 @@
 """zoo.py: an agent made of a run, shown, copied, played."""
 
 import json
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -8,12 +9,14 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from PIL import Image
 from run_folders import write_run
 from safetensors.torch import load_file
 
 from hdrqn_torchrl.analysis.zoo import add_agent, disagreement, score
 from hdrqn_torchrl.cli import watch, zoo
 from hdrqn_torchrl.cli.zoo import as_settings
+from hdrqn_torchrl.rendering import excerpt, record_episodes
 from hdrqn_torchrl.runs import load_agent
 from hdrqn_torchrl.runs.cards import cards_of
 
@@ -50,6 +53,7 @@ def test_an_agent_is_a_run_with_weights_of_16_bits_in_place_of_checkpoints(agent
     assert {path.name for path in (agents / "small-v2").iterdir()} == {
         "card.json",
         "config.yaml",
+        "play.gif",
         "weights.safetensors",
     }
     stored = load_file(agents / "small-v2/weights.safetensors")
@@ -83,8 +87,36 @@ def test_an_agent_stays_as_it_is_if_its_successor_comes_to_nothing(agents, tmp_p
     shutil.copy(agents.parent / "run/summary.json", run)
     with pytest.raises(RuntimeError):  # when new weights have been written
         add_agent(run, zoo_folder, "small-v2")
+    monkeypatch.setattr("hdrqn_torchrl.analysis.zoo.score", Mock(return_value=scores[0]))
+    monkeypatch.setattr("hdrqn_torchrl.analysis.zoo.write_video", Mock(side_effect=OSError("no space")))
+    with pytest.raises(SystemExit, match="no space"):  # when only picture and card are missing
+        call("add", "small-v2", f"run={run}", f"zoo={zoo_folder}")
     assert {path.name: path.read_bytes() for path in (zoo_folder / "small-v2").iterdir()} == before
     assert [path.name for path in zoo_folder.iterdir()] == ["small-v2"]
+
+
+def test_a_picture_shows_a_greedy_episode_to_its_end(agents):
+    (card,) = cards_of(agents)
+    agent = load_agent(agents / "small-v2")
+    frames = record_episodes(agent.env, agent.algorithm, seed=card.worlds_seed)
+    with Image.open(agents / "small-v2/play.gif") as picture:
+        assert picture.size == (440, 264)
+        assert picture.n_frames == len(excerpt(frames, 40)) <= 40
+
+
+def test_the_page_of_all_agents_is_written_between_its_marks(agents, tmp_path, capsys):
+    page = tmp_path / "docs/page.md"
+    page.parent.mkdir()
+    page.write_text("# Mine\n\n<!-- agents -->\noutdated\n<!-- end of agents -->\n\nAfter.\n")
+    call("page", f"zoo={agents}", f"out={page}")
+    text = page.read_text()
+    assert text.startswith("# Mine\n\n<!-- agents -->\n| agent |") and text.endswith("-->\n\nAfter.\n")
+    assert "outdated" not in text and "| [small-v2](#small-v2) | gridworld | v2 | 0k | 0 | abc | " in text
+    (picture,) = re.findall(r"!\[Greedy play of small-v2\]\((.*)\)", text)
+    assert (page.parent / picture).samefile(agents / "small-v2/play.gif")
+    assert capsys.readouterr().out == f"{page}: small-v2\n"
+    call("page", f"zoo={agents}", f"out={page}")
+    assert page.read_text() == text
 
 
 def test_a_score_agrees_with_the_card_unless_it_is_of_another_agent(agents):
@@ -116,7 +148,7 @@ def test_an_agent_is_played_as_a_run_is(agents, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["bark"], r"action must be one of list, get, watch, add, got 'bark'"),
+        (["bark"], r"action must be one of list, get, watch, add, page, got 'bark'"),
         (["get", "nobody"], r"name must be one of small-v2, got nobody"),
         (["watch"], r"name must be one of small-v2, got None"),
         (["add", "new"], r"run and name must be given"),

@@ -42,6 +42,16 @@ def test_fps_decides_the_duration_of_frames(tmp_path):
     assert read_gif(tmp_path / "fast.gif")[1] == [100, 50, 100, 2000]
 
 
+def test_narrower_pictures_make_a_smaller_file_in_the_same_colours(tmp_path):
+    for width in (760, 440):
+        write_video(walk("v2"), tmp_path / f"{width}.gif", width=width)
+    sizes = [(tmp_path / f"{width}.gif").stat().st_size for width in (760, 440)]
+    pictures, durations = read_gif(tmp_path / "440.gif")
+    assert {picture.shape for picture in pictures} == {(264, 440, 3)} and durations == [500, 250, 500, 2000]
+    assert sizes[1] < sizes[0]
+    assert (pictures[-1][250, 430] == (44, 160, 44)).all()
+
+
 def test_a_gif_of_one_frame_can_be_written(tmp_path):
     write_video(walk("v2")[:1], tmp_path / "one.gif")
     assert len(read_gif(tmp_path / "one.gif")[0]) == 1

@@ -1,0 +1,25 @@
+"""A short recording out of a long one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from hdrqn_torchrl.rendering.frames import Frame
+
+
+def excerpt(frames: Sequence[Frame], most: int) -> list[Frame]:
+    """The first episodes of a recording, whole, as far as there is room for them.
+
+    Of a first episode that is longer, every n-th moment and its end are left.
+
+    Args:
+        frames: what :func:`~hdrqn_torchrl.rendering.record_episodes` returned, at least one.
+        most: number of frames that there is room for.
+    """
+    ends = [place + 1 for place, frame in enumerate(frames) if frame.outcome] or [len(frames)]
+    fitting = [end for end in ends if end <= most]
+    if not fitting:
+        stride = -(-(ends[0] - 1) // max(most - 1, 1))
+        return [replace(frame, episodes=1) for frame in (*frames[: ends[0] - 1 : stride], frames[ends[0] - 1])]
+    return [replace(frame, episodes=len(fitting)) for frame in frames[: fitting[-1]]]
