@@ -23,7 +23,7 @@ from hdrqn_torchrl.algorithms.base import (
 from hdrqn_torchrl.algorithms.books import make_books
 from hdrqn_torchrl.algorithms.discovering import finding_subgoals, finds_subgoals
 from hdrqn_torchrl.algorithms.requirements import Requirements, check_environment
-from hdrqn_torchrl.algorithms.v3_sequences import check_learner, with_sequences
+from hdrqn_torchrl.algorithms.v3_sequences import check_learner, random_symmetry, with_sequences
 from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.data import StepSelector
 from hdrqn_torchrl.discovery import DiscoverySettings, discovered_set
@@ -69,6 +69,7 @@ def make_v3(
     max_meta_target: float | Literal["unbounded"] | None = None,
     prediction_steps: int = 4,
     prediction_weight: float = 0.1,
+    symmetries: bool = False,
 ) -> Algorithm:
     """hDRQNv3, this project's own agent: one memory for the whole episode, and all subgoals learn from every step.
 
@@ -112,6 +113,8 @@ def make_v3(
             the task states, if anything; ``"unbounded"``: no clipping.
         prediction_steps: largest number of steps ahead for which the memory learns to predict the observation
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: no prediction.
+        symmetries: whether sequences are also learned from as they would be in worlds that are turned or mirrored in
+            the ways that the task states (:class:`~hdrqn_torchrl.envs.Symmetry`).
 
     Raises:
         ValueError: if the environment lacks something or states too few sets of subgoals for ``levels``; if sequences
@@ -180,6 +183,8 @@ def make_v3(
             loss=loss,
             num_envs=has.num_envs,
             episode_len=has.task.max_steps,
+            refresh=random_symmetry(has.task, policy, learner) if symmetries else None,
+            refresh_reads=False,
             separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
         )
     books = make_books(

@@ -5,9 +5,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import replace
 
+from hdrqn_torchrl import keys
 from hdrqn_torchrl.data import FROM_STARTS
 from hdrqn_torchrl.envs import Task
-from hdrqn_torchrl.learning import LearnerSettings
+from hdrqn_torchrl.learning import LearnerSettings, RandomSymmetry
+from hdrqn_torchrl.modules import AllSubgoalsPolicy
 
 LONGEST_SEQUENCE = 200
 """Longest episode, in steps, that v3 replays as a whole by default."""
@@ -59,3 +61,28 @@ def with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
         stacklevel=3,
     )
     return replace(learner, slice_len=SHORT_SEQUENCE, sampling="steps", stored_state=True, burn_in=0.25)
+
+
+def random_symmetry(task: Task, policy: AllSubgoalsPolicy, learner: LearnerSettings) -> RandomSymmetry:
+    """Turns and mirrors the sequences in the ways that the task states.
+
+    Raises:
+        ValueError: if it states none, or sequences have states that were computed as they were.
+    """
+    if not task.symmetries:
+        raise ValueError(
+            "symmetries must be False for a task that states none, got True; an environment states them in its task."
+        )
+    if learner.stored_state:
+        raise ValueError(
+            "symmetries must be False with learner.stored_state=True, got True: the stored states are of what was seen "
+            "as it was; use sequences from the start of episodes."
+        )
+    mask = policy.action_mask_key
+    return RandomSymmetry(
+        task.symmetries,
+        observation_key=policy.observation_key,
+        action_keys=[keys.ACTION, policy.previous_action_key],
+        mask_keys=[] if mask is None else [mask],
+        device=next(policy.parameters()).device,
+    )

@@ -18,6 +18,7 @@ from hdrqn_torchrl.envs.gym.subgoals import Subgoals
 from hdrqn_torchrl.envs.montezuma.environment import MontezumaEnv
 from hdrqn_torchrl.envs.montezuma.making import make_montezuma
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
+from hdrqn_torchrl.envs.symmetry import Symmetry
 from hdrqn_torchrl.envs.task import Reference, Task, task_of
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Reference",
     "SubgoalSet",
     "Subgoals",
+    "Symmetry",
     "Task",
     "UniformRandom",
     "ceiling",

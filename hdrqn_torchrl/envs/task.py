@@ -20,6 +20,7 @@ from torchrl.envs.transforms import StepCounter, TransformedEnv
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.subgoals import SubgoalSet, check_flag, check_names, check_sets
+from hdrqn_torchrl.envs.symmetry import Symmetry, check_symmetries
 from hdrqn_torchrl.transforms import Critic
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class Task:
         actions: names of the actions.
         references: scripted players by name.
         ceiling: name of the one that learning curves are drawn against.
+        symmetries: ways to turn or mirror its worlds that leave the task as it is, but for leaving them as they are.
         scene: makes a picture of the present moment; ``None``: what the environment's ``render`` returns or, failing
             that, text.
         screen: a picture ``[height, width, 3]`` of where an episode begins, for environments whose entry ``position``
@@ -103,6 +105,7 @@ class Task:
     actions: tuple[str, ...] = ()
     references: Mapping[str, Reference] = field(default_factory=dict)
     ceiling: str | None = None
+    symmetries: tuple[Symmetry, ...] = ()
     scene: SceneFactory | None = None
     screen: Callable[[EnvBase], NDArray[np.uint8]] | None = None
 
@@ -111,6 +114,7 @@ class Task:
         _check_bounds(self.largest_return, self.smallest_extrinsic_return, self.largest_extrinsic_return)
         object.__setattr__(self, "subgoals", check_sets(self.subgoals))
         object.__setattr__(self, "actions", check_names("actions", self.actions))
+        object.__setattr__(self, "symmetries", check_symmetries(self.symmetries))
         check_flag("ordered", self.ordered)
         if not (isinstance(self.success, str) or is_seq_of_nested_key([self.success])):
             raise ValueError(f'success must be the name of an entry, got {self.success!r}; use "success".')
@@ -194,7 +198,7 @@ def task_of(env: EnvBase) -> Task:
 
 
 def _through(transform: Module, task: Task) -> Task:
-    """What is left of a statement behind a transform: one that changes rewards voids what was stated about them."""
+    """What is left of a statement behind a transform: what it changes is not what was stated."""
     if isinstance(transform, StepCounter):
         task = task.within(transform.max_steps)
     if isinstance(transform, Critic):
@@ -206,6 +210,8 @@ def _through(transform: Module, task: Task) -> Task:
         task = replace(task.without_references(), largest_return=math.inf)
     if keys.EXTRINSIC_REWARD in written:
         task = replace(task, largest_extrinsic_return=math.inf, smallest_extrinsic_return=-math.inf)
+    if keys.OBSERVATION in written or keys.ACTION in getattr(transform, "in_keys_inv", []):
+        task = replace(task, symmetries=())
     return task
 
 

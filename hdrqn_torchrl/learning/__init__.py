@@ -4,6 +4,7 @@ from hdrqn_torchrl.learning.learner import Learner
 from hdrqn_torchrl.learning.memory import Extract
 from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
 from hdrqn_torchrl.learning.phases import PhaseOne, Phases, phase_monitors
+from hdrqn_torchrl.learning.random_symmetry import RandomSymmetry
 from hdrqn_torchrl.learning.settings import LearnerSettings
 
 __all__ = [
@@ -13,6 +14,7 @@ __all__ = [
     "Monitor",
     "PhaseOne",
     "Phases",
+    "RandomSymmetry",
     "VisitCounter",
     "phase_monitors",
 ]

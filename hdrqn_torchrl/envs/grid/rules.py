@@ -20,7 +20,7 @@ from hdrqn_torchrl.envs.grid.layouts import OF_ROOMS, map_rows
 from hdrqn_torchrl.envs.grid.places import PlacedApart, Places, find_places
 
 ACTIONS = ("up", "down", "left", "right")
-_MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 LARGEST_TABLE = 1 << 24  # 0.1 GB each; a map of 40x40 cells that is seen whole
@@ -139,7 +139,7 @@ class GridRules:
         moves = torch.arange(self.nowhere)[:, None].repeat(1, len(ACTIONS))
         for cell in range(self.nowhere):
             row, column = divmod(cell, self.width)
-            for action, (down, right) in enumerate(_MOVES):
+            for action, (down, right) in enumerate(MOVES):
                 inside = 0 <= row + down < self.height and 0 <= column + right < self.width
                 target = (row + down) * self.width + column + right
                 if inside and not is_wall[target]:

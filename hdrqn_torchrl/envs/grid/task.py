@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.grid.measured import measured
 from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules
+from hdrqn_torchrl.envs.grid.symmetries import grid_symmetries
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
 from hdrqn_torchrl.envs.task import Figures, Reference, Task
 
@@ -45,6 +46,7 @@ def grid_task(rules: GridRules, settings: Mapping[str, Any]) -> Task:
         actions=ACTIONS,
         references={name: _reference(name, what, settings) for name, what in PLAYERS.items()},
         ceiling="memory",
+        symmetries=grid_symmetries(settings["layout"], rules.view) if rules.places is None else (),
         scene=grid_scene,
     )
 
