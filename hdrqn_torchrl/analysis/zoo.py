@@ -128,7 +128,7 @@ def training_command(overrides: Sequence[str], *, seed: int) -> str:
         last.pop(key, None)
         if not any(key.lstrip("+~") == own or key.lstrip("+~").startswith((f"{own}.", f"{own}/")) for own in _OWN):
             last[key] = override
-    last.setdefault("seed", f"seed={seed}")
+    last["seed"] = f"seed={seed}"
     return shlex.join(["hdrqn", "train", *last.values()])
 
 

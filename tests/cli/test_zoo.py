@@ -34,7 +34,7 @@ def agents(tmp_path_factory):
     run = folder / "run"
     run.mkdir()
     write_run(run)
-    overrides = ["env=gridworld", "algo=v2", f"hydra.run.dir={run}", "logger=csv", "seed=3"]
+    overrides = ["env=gridworld", "algo=v2", f"hydra.run.dir={run}", "logger=csv", "seed=0"]
     origin = {"choices": {"env": "gridworld", "algo": "v2"}, "overrides": overrides, "commit": "abc"}
     (run / "run.json").write_text(json.dumps(origin))
     (run / "summary.json").write_text(json.dumps({"frames": 200}))
@@ -45,7 +45,7 @@ def agents(tmp_path_factory):
 def test_a_card_says_what_an_agent_is_and_what_it_achieves(agents):
     (card,) = cards_of(agents)
     assert (card.name, card.task, card.algo, card.frames, card.episodes) == ("small-v2", "gridworld", "v2", 200, 50)
-    assert card.command == "hdrqn train env=gridworld algo=v2 seed=3" and card.commit == "abc"
+    assert card.command == "hdrqn train env=gridworld algo=v2 seed=0" and card.commit == "abc"
     assert set(card.figures) == {"return_mean", "success_rate", "steps_mean"} == set(card.intervals)
 
 
