@@ -119,7 +119,9 @@ def add(settings: Settings) -> None:
     from hdrqn_torchrl.analysis.zoo import add_agent
 
     zoo = Path(settings.zoo)
-    check_place(zoo / settings.name / layout.CARD, "zoo")
+    if Path(settings.name).name != settings.name:
+        raise SettingsError(f"name must be that of one folder, got {settings.name!r}; for example gridworld-v3.")
+    check_place(zoo / layout.CARD, "zoo")
     try:
         card = add_agent(
             Path(settings.run),

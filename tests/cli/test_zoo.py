@@ -153,11 +153,13 @@ def test_an_agent_is_played_as_a_run_is(agents, monkeypatch):
         (["watch"], r"name must be one of small-v2, got None"),
         (["add", "new"], r"run and name must be given"),
         (["add", "new", "run=nowhere"], r"run must be that of a finished training, got nowhere"),
+        (["add", "new/er", "run=nowhere"], r"name must be that of one folder, got 'new/er'"),
     ],
 )
-def test_mistakes_are_told(agents, arguments, message):
+def test_mistakes_are_told_and_leave_the_folder_as_it_was(agents, arguments, message):
     with pytest.raises(SystemExit, match=message):
         call(*arguments, f"zoo={agents}")
+    assert [path.name for path in agents.iterdir()] == ["small-v2"]
 
 
 def test_a_folder_without_agents_is_refused(tmp_path):
