@@ -122,9 +122,10 @@ class LateCheck:
 
 
 def multiplies_bfloat16(kind: str) -> bool:
-    """Whether devices of a kind (``"cpu"``, ``"cuda"``) have matrix units for bfloat16."""
+    """Whether devices of a kind (``"cpu"``, ``"cuda"``) multiply bfloat16 in hardware."""
     if kind == "cpu":
-        return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
+        has = torch.cpu.get_capabilities()
+        return bool(has.get("amx_bf16", False) or has.get("avx512_bf16", False))
     return kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
 
 

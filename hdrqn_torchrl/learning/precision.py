@@ -22,8 +22,9 @@ def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) ->
     """What a setting means for a network on its device.
 
     Args:
-        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it in hardware (a GPU that has it, a CPU with AMX)
-            and the network is large enough to gain, else ``"fp32"``. The same machine and network give the same answer.
+        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it in hardware (a GPU that has it, a CPU with AMX
+            or AVX-512 BF16) and the network is large enough to gain, else ``"fp32"``. The same machine and network give
+            the same answer.
         network: its parameters are where it will be trained.
 
     Raises:
@@ -41,7 +42,9 @@ def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) ->
     if wanted == "bf16" and not multiplies_bfloat16(kind):
         if kind != "cpu":
             raise ValueError(f"precision must be 'fp32' or 'auto' on this device ({kind}), which lacks bf16.")
-        warnings.warn("precision='bf16' is slow on a CPU without AMX; use 'auto' or 'fp32'.", stacklevel=2)
+        warnings.warn(
+            "precision='bf16' is slow on a CPU without AMX and AVX-512 BF16; use 'auto' or 'fp32'.", stacklevel=2
+        )
     return wanted
 
 

@@ -6,6 +6,7 @@ from helpers import ALGORITHMS, build, collect, small_env, tiny_settings
 from torch import nn
 
 from hdrqn_torchrl.algorithms import make_v3
+from hdrqn_torchrl.devices import multiplies_bfloat16
 from hdrqn_torchrl.learning import precision as precision_module
 from hdrqn_torchrl.learning.precision import choose_precision, gains, matrix_products
 from hdrqn_torchrl.modules import compact_network, paper_network
@@ -23,6 +24,14 @@ def hardware(monkeypatch):
 
 
 LARGE, SMALL = nn.LSTM(4, 128), nn.LSTM(4, 127)
+
+
+@pytest.mark.parametrize(
+    ("unit", "has"), [("amx_bf16", True), ("avx512_bf16", True), ("avx512_f", False)], ids=["amx", "avx512", "neither"]
+)
+def test_cpus_multiply_bfloat16_with_either_unit(unit, has, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {unit: True})
+    assert multiplies_bfloat16("cpu") == has
 
 
 class TestChoice:
@@ -46,9 +55,9 @@ class TestChoice:
             warnings.simplefilter("error")
             assert choose_precision(wanted, SMALL) == wanted
 
-    def test_bf16_on_a_cpu_without_amx_warns(self, hardware):
+    def test_bf16_on_a_cpu_that_lacks_it_warns(self, hardware):
         hardware()
-        with pytest.warns(UserWarning, match="precision='bf16' is slow on a CPU without AMX; "):
+        with pytest.warns(UserWarning, match="precision='bf16' is slow on a CPU without AMX and AVX-512 BF16; "):
             assert choose_precision("bf16", LARGE) == "bf16"
 
     def test_bf16_on_a_gpu_that_lacks_it_is_refused(self, hardware):

@@ -163,7 +163,7 @@ class TestAutocast:
     def test_the_cell_keeps_its_precision_under_autocast(self, on_gpu, monkeypatch):
         """0.001 is added to a cell at each of 200 steps; in bfloat16 the sum would stop growing."""
         if not on_gpu and not multiplies_bfloat16("cpu"):
-            pytest.skip("without AMX the cell is lowered, too")
+            pytest.skip("without bfloat16 in hardware the cell is lowered, too")
         monkeypatch.setattr(lstm_module, "on_host", lambda tensor: not on_gpu)
         lstm = nn.LSTM(1, 1, batch_first=True).requires_grad_(False)
         lstm.weight_ih_l0.zero_(), lstm.weight_hh_l0.zero_(), lstm.bias_hh_l0.zero_()
