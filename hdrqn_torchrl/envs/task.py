@@ -133,6 +133,13 @@ class Task:
         """The same task for which scripted players don't play."""
         return replace(self, references={}, ceiling=None)
 
+    def without_returns(self) -> Task:
+        """The same task with rewards of whose sums nothing is known."""
+        return replace(
+            self.without_references(), largest_return=math.inf, largest_extrinsic_return=math.inf,
+            smallest_extrinsic_return=-math.inf,
+        )  # fmt: skip
+
 
 def _check_length(max_steps: int | None) -> None:
     whole = isinstance(max_steps, Integral) and not isinstance(max_steps, bool)

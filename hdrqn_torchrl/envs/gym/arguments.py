@@ -16,6 +16,7 @@ from hdrqn_torchrl.envs.gym.given import check_rule
 from hdrqn_torchrl.envs.gym.subgoals import Subgoals
 from hdrqn_torchrl.envs.gym.worlds import Rule
 from hdrqn_torchrl.envs.subgoals import check_names
+from hdrqn_torchrl.envs.task import Task
 
 PACKAGES = {
     "ALE/": "ale_py",
@@ -45,8 +46,19 @@ def actions_of(space: spaces.Space, chosen: Sequence[int] | None) -> tuple[int, 
     return tuple(chosen)
 
 
+def stated_by(env: gymnasium.Env) -> Task:
+    """The attribute ``task`` of an environment, if it is a :class:`Task`; else one that states nothing."""
+    stated = getattr(env.unwrapped, "task", None)
+    return stated if isinstance(stated, Task) else Task()
+
+
 def action_names_of(env: gymnasium.Env, actions: Sequence[int]) -> tuple[str, ...]:
-    """As ALE's environments and MiniGrid's tell them; empty if the environment does not."""
+    """As its :class:`Task`, ALE's environments and MiniGrid's tell them; empty if the environment does not."""
+    space = env.action_space
+    if (stated := stated_by(env).actions) and isinstance(space, spaces.Discrete):
+        if len(stated) != space.n:
+            raise ValueError(f"task.actions must name the {space.n} actions of the environment, got {list(stated)}.")
+        return tuple(stated[action - int(space.start)] for action in actions)
     meanings = getattr(env.unwrapped, "get_action_meanings", None)
     if callable(meanings):
         return tuple(str(meanings()[action]).lower() for action in actions)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
 
@@ -23,6 +22,7 @@ from hdrqn_torchrl.envs.gym.arguments import (
     make_world,
     refuse_ignored,
     rule_of,
+    stated_by,
     subgoals_of,
     wrappers_of,
 )
@@ -65,9 +65,10 @@ def make_gym(
 ) -> GymTaskEnv:
     """N worlds of a Gymnasium environment, with the project's entries.
 
-    What it shows becomes one tensor (:func:`~hdrqn_torchrl.envs.gym.make_encoder` says how). Episodes that terminate
-    are ``terminated``, those that a time limit ends are ``truncated``. Every episode has a seed of its own, drawn from
-    ``seed``, so that a resumed training can play it again up to where it was.
+    What it shows becomes one tensor (:func:`~hdrqn_torchrl.envs.gym.make_encoder` says how). What it states in an
+    attribute ``task``, a :class:`~hdrqn_torchrl.envs.Task`, holds as far as no argument says or changes it. Episodes
+    that terminate are ``terminated``, those that a time limit ends are ``truncated``. Every episode has a seed of its
+    own, drawn from ``seed``, so that a resumed training can play it again up to where it was.
 
     Strings that name something of a package (``"my_package.DoorSubgoals"``) are for settings: they are imported.
 
@@ -135,13 +136,20 @@ def make_gym(
         )
     else:
         raise ValueError(f"backend must be 'gymnasium' or 'envpool', got {backend!r}.")
-    largest, smallest = (math.inf if largest_return is None else largest_return), smallest_return
-    task = Task(
-        max_steps=max_steps or made.max_steps,
-        largest_return=largest,
-        largest_extrinsic_return=largest,
-        smallest_extrinsic_return=-math.inf if smallest is None else smallest,
+    stated = made.stated
+    if reward is not None or wrappers:
+        stated = stated.without_returns()
+    if actions is not None or wrappers:
+        stated = replace(stated, symmetries=())
+    if largest_return is None:
+        largest_return = min(stated.largest_return, stated.largest_extrinsic_return)
+    task = replace(
+        stated.within(max_steps or made.max_steps),
+        largest_return=largest_return,
+        largest_extrinsic_return=largest_return,
+        smallest_extrinsic_return=stated.smallest_extrinsic_return if smallest_return is None else smallest_return,
         subgoals=tuple(each.stated for each in made.reading.subgoals),
+        success=keys.SUCCESS,
         actions=made.action_names,
     )
     return GymTaskEnv(
@@ -160,6 +168,7 @@ class _Made:
     action_names: tuple[str, ...] = ()
     max_steps: int | None = None
     render: Callable[[], Any] | None = None
+    stated: Task = field(default_factory=Task)
 
 
 def _read(
@@ -185,7 +194,7 @@ def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, p
     try:
         _, info = begun(probe, seed=0)
         reading, actions = read(probe.observation_space, probe.action_space, masked=keys.ACTION_MASK in info)
-        names, limit = action_names_of(probe, actions), _time_limit(probe)
+        names, limit, stated = action_names_of(probe, actions), _time_limit(probe), stated_by(probe)
         modes = probe.metadata.get("render_modes") or ()
     finally:
         probe.close()
@@ -198,7 +207,7 @@ def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, p
         vector = SyncVectorEnv(worlds, copy=False, autoreset_mode=AutoresetMode.DISABLED)
     return _Made(
         worlds=OwnWorlds(vector), reading=reading, actions=actions, action_names=names, max_steps=limit,
-        render=partial(_picture, vector),
+        render=partial(_picture, vector), stated=stated,
     )  # fmt: skip
 
 

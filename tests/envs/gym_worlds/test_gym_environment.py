@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit, TransformObservation
 from torchrl.envs.utils import check_env_specs
 
-from hdrqn_torchrl.envs import check_task, make_gym
+from hdrqn_torchrl.envs import Reference, Symmetry, Task, check_task, make_gym
 from hdrqn_torchrl.envs.gym import worlds
 
 STEPS = 40
@@ -233,6 +233,53 @@ class TestState:
 def test_what_cannot_be_made_is_refused(id, settings, words):
     with pytest.raises((ValueError, ImportError), match=words):
         make_gym(id, **settings)
+
+
+class Stating(Counter):
+    """Says what it is like."""
+
+    def __init__(self, actions=("one", "two")):
+        super().__init__()
+        self.task = Task(
+            max_steps=20, largest_return=1.0, smallest_extrinsic_return=0.0, ordered=True, actions=actions,
+            references={"counts": Reference(what="the count", play=lambda seconds: {"return_mean": 1.0})},
+            ceiling="counts", symmetries=(Symmetry(places=(0, 1), actions=(1, 0)),),
+        )  # fmt: skip
+
+
+class TestStatement:
+    """What an environment says in its attribute ``task``."""
+
+    def test_holds(self):
+        task = make_gym(Stating, 2, subgoals=Milestones()).task
+        assert (task.max_steps, task.ordered, task.actions, task.ceiling) == (20, True, ("one", "two"), "counts")
+        assert (task.largest_return, task.largest_extrinsic_return, task.smallest_extrinsic_return) == (1.0, 1.0, 0.0)
+        assert task.subgoals[0].names == Milestones.names and len(task.symmetries) == 1
+
+    def test_gives_way_to_arguments(self):
+        task = make_gym(Stating, 2, max_steps=5, largest_return=3.0, smallest_return=-1.0).task
+        assert (task.max_steps, task.largest_return, task.smallest_extrinsic_return) == (5, 3.0, -1.0)
+        assert task.ceiling is None, "its players play longer episodes"
+
+    @pytest.mark.parametrize("change", [{"reward": "count"}, {"wrappers": [lambda env: env]}])
+    def test_of_returns_is_forgotten_where_rewards_may_be_others(self, change):
+        task = make_gym(Stating, 2, **change).task
+        assert (task.largest_return, task.smallest_extrinsic_return, task.references) == (np.inf, -np.inf, {})
+        assert task.ordered and task.actions == ("one", "two")
+
+    def test_names_the_actions_that_are_left(self):
+        task = make_gym(Stating, 2, actions=[1]).task
+        assert task.actions == ("two",) and task.symmetries == ()
+
+    def test_of_other_actions_is_refused(self):
+        with pytest.raises(ValueError, match=r"task.actions must name the 2 actions of the environment, got \['go'\]"):
+            make_gym(lambda: Stating(("go",)), 2)
+
+    def test_of_another_kind_is_left_alone(self):
+        class Chores(Counter):
+            task = "wash up"
+
+        assert make_gym(Chores, 2).task == Task()
 
 
 def test_subgoals_that_return_a_wrong_number_of_conditions_are_refused():
