@@ -20,7 +20,7 @@ from omegaconf import open_dict
 
 from hdrqn_torchrl.cli.command_line import overrides_last, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, resolved
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.arguments import SettingsError, remedy
 from hdrqn_torchrl.runs.building import build, build_env
 from hdrqn_torchrl.runs.commands import as_called, command_of
 from hdrqn_torchrl.runs.settings import RunSettings, check
@@ -62,7 +62,7 @@ def composed(arguments: list[str]) -> RunSettings:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose("config", overrides=overrides, return_hydra_config=True)
     except HydraException as error:
-        raise SettingsError(str(error).splitlines()[0]) from error
+        raise SettingsError(f"{str(error).splitlines()[0].rstrip('.')}; {remedy()}.") from error
     with open_dict(config):
         del config["hydra"]
     settings = resolved(config)

@@ -28,6 +28,8 @@ PACKAGES = {
 }
 """Packages that register environments, by how the ids begin. They are imported for these ids."""
 
+_ON_THE_PATH = "name the folder that holds it: export PYTHONPATH=$PWD"
+
 SomeSubgoals = Subgoals | str | Sequence[Subgoals | str] | None
 
 
@@ -144,7 +146,10 @@ def _named(argument: str, value: Any) -> Any:
     try:
         return pkgutil.resolve_name(value)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"{argument} must name something that can be imported, got {value!r} ({error}).") from error
+        remedy = f"; {_ON_THE_PATH}" if isinstance(error, ModuleNotFoundError) else ""
+        raise ValueError(
+            f"{argument} must name something that can be imported, got {value!r} ({error}){remedy}."
+        ) from error
 
 
 def import_package_of(id: str, package: str | None = None) -> None:
@@ -163,7 +168,9 @@ def import_package_of(id: str, package: str | None = None) -> None:
         try:
             gymnasium.register_envs(importlib.import_module(name))
         except ImportError as error:
-            raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it.") from error
+            raise ImportError(
+                f"{id} needs {name}, which can't be imported ({error}); install it, or {_ON_THE_PATH}."
+            ) from error
         if name == "minigrid":
             _silence_babyai()
 

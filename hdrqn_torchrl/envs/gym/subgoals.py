@@ -134,8 +134,12 @@ class SubgoalRecord:
 
     def _failure(self, method: str, error: Exception) -> ReturnError:
         """What to say of an error in a user's own method."""
-        blind = self.env is None and isinstance(error, AttributeError)
-        remedy = "; env is None for EnvPool and for vectors made elsewhere: use before, after and info" * blind
+        remedy = ""
+        if isinstance(error, AttributeError):
+            if self.env is None:
+                remedy = "; env is None for EnvPool and for vectors made elsewhere: use before, after and info"
+            elif error.obj is self.env is not self.env.unwrapped and hasattr(self.env.unwrapped, error.name or ""):
+                remedy = f"; env is what wrappers show of it: use env.unwrapped.{error.name}"
         own = f"{type(self.subgoals).__name__} ({', '.join(self.subgoals.names)})"
         return ReturnError(
             f"subgoals.{method} of {own} must not fail, got {type(error).__name__}: {error}, {self._steps} steps into "

@@ -206,6 +206,8 @@ class TestState:
         ("CartPole-v1", {"backend": "jax"}, "backend must be 'gymnasium' or 'envpool', got 'jax'"),
         ("CartPole-v1", {"max_steps": 0}, "max_steps must be a whole number >= 1, got 0; None"),
         ("CartPole-v1", {"subgoals": "no.such"}, "subgoals must name something that can be imported, got 'no.such'"),
+        ("CartPole-v1", {"subgoals": "no.such"}, r"No module named 'no'\); name the folder .* export PYTHONPATH=\$PWD"),
+        ("CartPole-v1", {"subgoals": "gym_toys.Nope"}, r"'gym_toys.Nope' \(module .* no attribute 'Nope'\)\.$"),
         ("CartPole-v1", {"subgoals": 3}, "subgoals must have names and a method conditions, got 3"),
         ("CartPole-v1", {"num_envs": "2"}, "num_envs must be a whole number >= 1, got '2'"),
         ("CartPole-v1", {"num_envs": None}, "num_envs must be a whole number >= 1, got None"),
@@ -226,7 +228,7 @@ class TestState:
         ("", {}, "id must be the id of an environment, a function .* got ''"),
         (Counter(), {}, "id must be the id of an environment, .*; pass the function that makes it"),
         (lambda: None, {}, "id, a function, must return an environment of Gymnasium, got one that returned None"),
-        ("nopkg:Foo-v0", {}, "nopkg:Foo-v0 needs nopkg, which can't be imported"),
+        ("nopkg:Foo-v0", {}, "nopkg:Foo-v0 needs nopkg, which can't be imported .*; install it, or .* PYTHONPATH"),
         ("CartPole-v1", {"package": "no_such_package"}, "CartPole-v1 needs no_such_package, which can't be imported"),
     ],
 )

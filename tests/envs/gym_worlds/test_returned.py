@@ -9,6 +9,7 @@ import torch
 from gym_toys import Counter
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import TimeLimit
 
 from hdrqn_torchrl.envs import check_task, make_gym
 from hdrqn_torchrl.envs.gym import Subgoals, make_encoder
@@ -226,6 +227,10 @@ class TestSubgoals:
 
         words = r"subgoals.conditions of Own \(a, b\) must not fail, got KeyError: 'door', 2 steps into an episode"
         refused(words, made_with(fail))
+
+    def test_that_overlook_wrappers_are_told_of_them(self):
+        env = made_with(lambda env, *_: (env.steps > 1, False), lambda: TimeLimit(Odd(), 9))
+        refused("no attribute 'steps', .*; env is what wrappers show of it: use env.unwrapped.steps", env)
 
     def test_that_look_into_worlds_which_can_not_be_looked_into_are_told_so(self):
         vector = SyncVectorEnv([Counter] * 2, autoreset_mode=AutoresetMode.DISABLED)
