@@ -6,6 +6,7 @@ import csv
 import math
 import os
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,9 @@ from hdrqn_torchrl.runs.services import make_mlflow_logger, make_tensorboard_log
 __all__ = ["CSVLog", "RunLogger", "make_mlflow_logger", "make_tensorboard_logger", "make_wandb_logger"]
 
 Row = dict[str, float]
+
+
+_QUIET_SECONDS = 60.0
 
 
 class CSVLog:
@@ -104,7 +108,8 @@ class RunLogger:
         folder: run folder.
         total_frames: end of the progress bar.
         loggers: any TorchRL loggers (TensorBoard, W&B, ...); scalars are logged under their column's name.
-        console: where progress goes; a terminal shows a bar, anything else a line per greedy evaluation.
+        console: where progress goes; a terminal shows a bar, anything else a line per greedy evaluation, and for one
+            of the log points in between if there was none for a minute.
         label: put before those lines, to tell the runs of a sweep apart.
         bar: whether a terminal shows a bar.
     """
@@ -135,6 +140,7 @@ class RunLogger:
         self._task = self._progress.add_task("training", total=total_frames, numbers="")
         self._progress.start()
         self._last_greedy = ""
+        self._last_line = time.monotonic()
         self._going = False
 
     def log(self, row: Row) -> None:
@@ -153,8 +159,13 @@ class RunLogger:
             self._last_greedy = f"greedy {row['greedy/return']:+.2f}{ceiling}{success}"
         numbers = progress_line(row, self._last_greedy)
         self._progress.update(self._task, completed=frames, numbers=numbers)
-        if evaluated and not self._bar:
+        if not self._bar and (evaluated or time.monotonic() >= self._last_line + _QUIET_SECONDS):
             self.console.print(f"{self.label}{frames:>9,} frames  {numbers}", highlight=False, soft_wrap=True)
+            self._last_line = time.monotonic()
+
+    def advance(self, frames: int) -> None:
+        """Moves the progress bar; the numbers beside it stay those of the last log point."""
+        self._progress.update(self._task, completed=frames)
 
     def _go_on(self) -> None:
         """Before the first row: loggers that can go back to the last row of the table do so."""

@@ -179,6 +179,7 @@ class Trainer:
             self.frames += batch.numel()
             self.algorithm.observe(batch)
             self.episodes += self._window.add_episodes(self._incoming.take(batch))
+        self.logger.advance(self.frames)
 
     def _complete_iteration(self) -> Iterator[None]:
         """All updates that are owed, then what is due at these frames; picks up where a stopped one ended."""

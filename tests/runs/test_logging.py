@@ -2,6 +2,7 @@ import csv
 import io
 import os
 import sys
+import time
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -176,6 +177,20 @@ class TestRunLogger:
         assert len(lines) == 1
         for part in ("1,000 frames", "greedy +1.25 of 2.00", "success 50%", "2,000 frames/s", "epsilon sub 0.50"):
             assert part in lines[0]
+
+    def test_without_a_terminal_a_minute_without_a_line_ends_with_the_next_row(self, tmp_path, monkeypatch):
+        logger, console = run_logger(tmp_path)
+        now = time.monotonic()
+        monkeypatch.setattr("hdrqn_torchrl.runs.logging.time.monotonic", lambda: now + 61)
+        logger.log(ROW)
+        logger.log(ROW)
+        assert [line.split("  ")[0] for line in console.file.getvalue().strip().splitlines()] == ["1,000 frames"]
+
+    def test_the_bar_moves_between_rows(self, tmp_path):
+        logger, console = run_logger(tmp_path, terminal=True)
+        logger.advance(500)
+        logger.close()
+        assert "500/10,000 frames" in console.file.getvalue()
 
     def test_a_terminal_shows_a_progress_bar(self, tmp_path):
         logger, console = run_logger(tmp_path, terminal=True)

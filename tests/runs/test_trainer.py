@@ -72,7 +72,10 @@ def quiet_batch(done=False):
 
 class FakeLogger(Stateless):
     def __init__(self):
-        self.rows, self.closed, self.said = [], False, []
+        self.rows, self.closed, self.said, self.advanced = [], False, [], []
+
+    def advance(self, frames):
+        self.advanced.append(frames)
 
     def say(self, sentence):
         self.said.append(sentence)
@@ -126,6 +129,11 @@ class TestTime:
         trainer.evaluate = lambda: seen.append(trainer.collector.weight_updates) or {"return_mean": 0.0}
         trainer.train()
         assert seen == [1, 3]  # workers get the weights first
+
+    def test_the_logger_is_told_of_every_batch(self):
+        trainer = make_trainer(total_frames=30, log_frames=1_000)
+        trainer.train()
+        assert trainer.logger.advanced == [10, 20, 30]
 
     def test_training_stops_at_the_first_batch_that_completes_total_frames(self):
         trainer = make_trainer(total_frames=25)
