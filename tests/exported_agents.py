@@ -20,6 +20,7 @@ KINDS = {
     "v2 with three levels": ("v2", house, {"levels": 3}),
     "v3 with one level": ("v3", small_env, {"levels": 1}),
     "v3": ("v3", small_env, {}),
+    "v3 with symmetries": ("v3", small_env, {"symmetries": True}),
     "v3 with three levels": ("v3", house, {"levels": 3}),
     "v3 that finds its subgoals": ("v3", small_env, {"subgoals": "discovered"}),
     "masked actions": ("v2", lambda number, **_: Corridor(number, length=12, masked=True), {}),

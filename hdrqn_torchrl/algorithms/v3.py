@@ -23,7 +23,7 @@ from hdrqn_torchrl.algorithms.base import (
 from hdrqn_torchrl.algorithms.books import make_books
 from hdrqn_torchrl.algorithms.discovering import finding_subgoals, finds_subgoals
 from hdrqn_torchrl.algorithms.requirements import Requirements, check_environment
-from hdrqn_torchrl.algorithms.v3_sequences import check_learner, random_symmetry, with_sequences
+from hdrqn_torchrl.algorithms.v3_sequences import check_learner, random_symmetry, symmetries_of, with_sequences
 from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.data import StepSelector
 from hdrqn_torchrl.discovery import DiscoverySettings, discovered_set
@@ -113,8 +113,9 @@ def make_v3(
             the task states, if anything; ``"unbounded"``: no clipping.
         prediction_steps: largest number of steps ahead for which the memory learns to predict the observation
             (:class:`~hdrqn_torchrl.modules.ObservationPredictor`); 0: no prediction.
-        symmetries: whether sequences are also learned from as they would be in worlds that are turned or mirrored in
-            the ways that the task states (:class:`~hdrqn_torchrl.envs.Symmetry`).
+        symmetries: whether the agent uses the ways to turn or mirror worlds that the task states
+            (:class:`~hdrqn_torchrl.envs.Symmetry`): it learns from sequences as they would be there, too, and acts by
+            the mean of its Q-values over all of them.
 
     Raises:
         ValueError: if the environment lacks something or states too few sets of subgoals for ``levels``; if sequences
@@ -140,6 +141,7 @@ def make_v3(
     own = discovered_set(discovery.max_subgoals) if finds else None
     has = check_environment(env, architecture, builder="make_v3", levels=levels, discovered=own)
     learner = with_sequences(learner.lasting(total_frames), has.task)
+    turns = symmetries_of(has.task, learner, finds_subgoals=finds) if symmetries else ()
     sub_exploration = sub_exploration or presets.v3_sub_exploration()
     meta_exploration = meta_exploration or presets.meta_exploration()
     policy = AllSubgoalsPolicy(
@@ -149,6 +151,7 @@ def make_v3(
         middle_explorations=[deepcopy(middle_exploration or meta_exploration) for _ in has.subgoals[:-1]],
         subgoal_keys=[each.keys for each in has.subgoals],
         action_mask_key=has.action_mask_key,
+        symmetries=turns,
     ).to(env.device)
     flat = levels == 1
     loss = AllSubgoalsLoss(
@@ -183,7 +186,7 @@ def make_v3(
             loss=loss,
             num_envs=has.num_envs,
             episode_len=has.task.max_steps,
-            refresh=random_symmetry(has.task, policy, learner) if symmetries else None,
+            refresh=random_symmetry(turns, policy),
             refresh_reads=False,
             separate=None if joint else {"network.meta_head": meta_rate / learner.learning_rate},
         )

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data import FROM_STARTS
-from hdrqn_torchrl.envs import Task
+from hdrqn_torchrl.envs import Symmetry, Task
 from hdrqn_torchrl.learning import LearnerSettings, RandomSymmetry
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
 
@@ -63,12 +63,18 @@ def with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
     return replace(learner, slice_len=SHORT_SEQUENCE, sampling="steps", stored_state=True, burn_in=0.25)
 
 
-def random_symmetry(task: Task, policy: AllSubgoalsPolicy, learner: LearnerSettings) -> RandomSymmetry:
-    """Turns and mirrors the sequences in the ways that the task states.
+def symmetries_of(task: Task, learner: LearnerSettings, *, finds_subgoals: bool) -> tuple[Symmetry, ...]:
+    """The ways to turn and mirror the task's worlds, if an agent may use them.
 
     Raises:
-        ValueError: if it states none, or sequences have states that were computed as they were.
+        ValueError: if the task states none, sequences have states that were computed as worlds were, or subgoals may be
+            of places.
     """
+    if finds_subgoals:
+        raise ValueError(
+            "symmetries must be False with subgoals='discovered', got True: what happens at a place is another event "
+            "in a turned world."
+        )
     if not task.symmetries:
         raise ValueError(
             "symmetries must be False for a task that states none, got True; an environment states them in its task."
@@ -78,9 +84,16 @@ def random_symmetry(task: Task, policy: AllSubgoalsPolicy, learner: LearnerSetti
             "symmetries must be False with learner.stored_state=True, got True: the stored states are of what was seen "
             "as it was; use sequences from the start of episodes."
         )
+    return task.symmetries
+
+
+def random_symmetry(symmetries: tuple[Symmetry, ...], policy: AllSubgoalsPolicy) -> RandomSymmetry | None:
+    """Turns and mirrors the policy's sequences, if there are ways to."""
+    if not symmetries:
+        return None
     mask = policy.action_mask_key
     return RandomSymmetry(
-        task.symmetries,
+        symmetries,
         observation_key=policy.observation_key,
         action_keys=[keys.ACTION, policy.previous_action_key],
         mask_keys=[] if mask is None else [mask],

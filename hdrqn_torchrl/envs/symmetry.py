@@ -51,6 +51,12 @@ def check_symmetries(symmetries: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
     return tuple(symmetries)
 
 
+def with_identity(symmetries: Sequence[Symmetry]) -> tuple[Symmetry, ...]:
+    """Those of a task, at least one, behind the one that leaves its worlds as they are."""
+    first = symmetries[0]
+    return Symmetry(places=tuple(range(len(first.places))), actions=tuple(range(len(first.actions)))), *symmetries
+
+
 def _permutation(name: str, numbers: Sequence[int]) -> tuple[int, ...]:
     listed = tuple(numbers) if isinstance(numbers, Sequence) and not isinstance(numbers, str) else ()
     whole = all(isinstance(each, Integral) and not isinstance(each, bool) for each in listed)

@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
-from hdrqn_torchrl.envs.symmetry import Symmetry
+from hdrqn_torchrl.envs.symmetry import Symmetry, with_identity
 
 
 class RandomSymmetry:
@@ -45,9 +45,7 @@ class RandomSymmetry:
     ) -> None:
         if not symmetries:
             raise ValueError("symmetries must be those of a task, at least one, got none; leave RandomSymmetry out.")
-        first = symmetries[0]
-        same = Symmetry(places=tuple(range(len(first.places))), actions=tuple(range(len(first.actions))))
-        every = [same, *symmetries]
+        every = with_identity(symmetries)
         self._places = torch.tensor([each.places for each in every], device=device)
         self._actions = torch.tensor([each.actions for each in every], device=device)
         self._were = self._actions.argsort(-1)  # for each action of the changed world, which one it was

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -13,6 +14,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.envs.symmetry import Symmetry
 from hdrqn_torchrl.modules.all_subgoals_network import AllSubgoalsNetwork
 from hdrqn_torchrl.modules.controllers import first_state
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, carried_by, choose
@@ -22,6 +24,7 @@ from hdrqn_torchrl.modules.exploration_checks import (
     check_two_schedules,
     exploration_or_greedy,
 )
+from hdrqn_torchrl.modules.symmetric_mean import SymmetricMean
 
 
 class AllSubgoalsPolicy(TensorDictModuleBase):
@@ -41,9 +44,12 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         subgoal_keys: entries of each of the network's sets of subgoals, from near to far.
         observation_key, previous_action_key, init_key: entries that are read.
         action_key, action_value_key: entries that are written.
-        hidden_key, cell_key: LSTM state ``[H]``.
+        hidden_key, cell_key: LSTM state ``[H]``, with ``symmetries`` ``[K * H]`` in acting.
         exploration_key: state that the exploration of actions carries, if any.
         action_mask_key: actions that can be chosen ``[A]`` bool; ``None``: all of them.
+        symmetries: ways to turn or mirror worlds; given, acting goes by the mean of Q-values over all of them
+            (:class:`~hdrqn_torchrl.modules.symmetric_mean.SymmetricMean`), and its LSTM state is that of K worlds,
+            ``[K * H]``.
 
     Raises:
         ValueError: if an exploration is not an ``EpsilonGreedy``, serves two levels or can't choose subgoals, or if
@@ -78,6 +84,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         cell_key: NestedKey = keys.MEMORY_CELL,
         exploration_key: NestedKey = keys.ACTION_EXPLORATION,
         action_mask_key: NestedKey | None = None,
+        symmetries: Sequence[Symmetry] = (),
     ) -> None:
         super().__init__()
         if len(subgoal_keys) != len(network.num_subgoals):
@@ -86,6 +93,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
                 f"subgoals, got {len(subgoal_keys)}; give them from near to far."
             )
         self.network = network
+        self.symmetric_mean = SymmetricMean(symmetries) if symmetries else None
         self.sub_exploration = exploration_or_greedy(sub_exploration, "sub_exploration")
         if subgoal_keys:
             self.meta_exploration = exploration_or_greedy(meta_exploration, "meta_exploration")
@@ -137,7 +145,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """A transform that adds an empty memory to every reset."""
-        state = Unbounded(shape=(self.network.hidden_size,))
+        worlds = 1 if self.symmetric_mean is None else self.symmetric_mean.number
+        state = Unbounded(shape=(worlds * self.network.hidden_size,))
         carried = {self.hidden_key: state, self.cell_key: state.clone()}
         carried[self.previous_action_key] = Categorical(self.network.num_actions, shape=(), dtype=torch.int64)
         return TensorDictPrimer({**carried, **self._carried}, expand_specs=True)
@@ -154,7 +163,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
                 tensordict.set(key, value)
             return tensordict.set(self.hidden_key, memory)
         state = tensordict.get(self.hidden_key), tensordict.get(self.cell_key)
-        values, (hidden, cell) = self.network.step(observation, previous_action, init, masks, state)
+        step = self.network.step if self.symmetric_mean is None else partial(self.symmetric_mean.step, self.network)
+        values, (hidden, cell) = step(observation, previous_action, init, masks, state)
         subgoal, starts = self._choose_subgoals(values[1:], masks, tensordict)
         wanted = values[0].squeeze(-2) if subgoal is None else values_of(values[0], subgoal)
         sub, key = self.sub_exploration, self.exploration_key
