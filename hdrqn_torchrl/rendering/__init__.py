@@ -1,7 +1,7 @@
 """Recorded episodes: what the agent sees, wants and does, as pictures, videos and terminal text."""
 
 from hdrqn_torchrl.rendering.episodes import record_episodes
-from hdrqn_torchrl.rendering.excerpt import excerpt
+from hdrqn_torchrl.rendering.excerpts import excerpt
 from hdrqn_torchrl.rendering.frames import Decision, Frame, Pursuit, Score
 from hdrqn_torchrl.rendering.levels import BarSpans, bar_spans
 from hdrqn_torchrl.rendering.picture import draw_frame
