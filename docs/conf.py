@@ -33,6 +33,7 @@ html_math_renderer = "mathml"  # which browsers draw without a script
 html_title = PACKAGE
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_show_copyright = False
 html_show_sourcelink = False
 
 myst_enable_extensions = ["dollarmath", "attrs_inline", "colon_fence"]
@@ -81,8 +82,8 @@ def find_exported(app: Any, env: Any, node: Any, content: Any) -> Any:
     return None
 
 
-OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\((?:\.\./)+([^)#]+)\)")
-"""Links of a page, not pictures, to what is no part of the site: the names of files of the checkout."""
+UPWARDS = re.compile(r"(?<!!)\[[^\]]+\]\(((?:\.\./)+)([^)#]+)\)")
+"""Links, not pictures, to what lies in a folder above."""
 
 
 def prepare(app: Any, page: str, source: list[str]) -> None:
@@ -90,7 +91,12 @@ def prepare(app: Any, page: str, source: list[str]) -> None:
     if page == "changelog":
         source[0] = (ROOT / "CHANGELOG.md").read_text().replace("](docs/", "](")
         source[0] = re.sub(r"\[([^\]]+)\]\((examples|benchmarks)/[^)]*\)", r"`\1`", source[0])
-    source[0] = OUTSIDE.sub(r"`\2`", source[0])
+    source[0] = UPWARDS.sub(lambda link: shown(link, page.count("/")), source[0])
+
+
+def shown(link: re.Match[str], depth: int) -> str:
+    """The link as it is, or the name of the file, if it leads out of the site from a page so many folders deep."""
+    return f"`{link[2]}`" if link[1].count("../") > depth else link[0]
 
 
 def write_math(translator: Any, node: Any) -> None:
