@@ -40,7 +40,7 @@ AGENT, OBJECTS = torch.tensor([7]), torch.tensor([[8, 9, 10]])
 LEFT, RIGHT = 2, 3
 
 ALGORITHMS = ("dqn", "drqn", "hdqn", "v1", "v2")
-CLOCK = ("wall_seconds", "frames_per_second", "updates_per_second")
+CLOCK = ("wall_seconds", "processor_seconds", "frames_per_second", "updates_per_second")
 
 
 def small_env(num_envs: int = 4, **settings) -> MultiGoalGridEnv:
@@ -170,7 +170,7 @@ def contents(folder: Path) -> dict:
 
 def _without_clock(node):
     if isinstance(node, list):
-        is_clock = len(node) == 2 and node[0] in ("wall_seconds", "seconds")
+        is_clock = len(node) == 2 and node[0] in ("wall_seconds", "processor_seconds", "seconds")
         return node[:1] if is_clock else [_without_clock(item) for item in node]
     return {key: _without_clock(item) for key, item in node.items()} if isinstance(node, dict) else node
 

@@ -18,7 +18,7 @@ class Arguments:
         id: of a MiniGrid or BabyAI task, or the name of a grid world (tasks.py).
         seed: of the training.
         frames: environment steps of the training, all worlds together.
-        seconds: wall time after which a training stops, evaluations included; the same command goes on with more.
+        seconds: processor time after which a training stops, evaluations included; the same command goes on with more.
         bonus: added to the reward for each subgoal attained.
         max_steps: length of an episode; 0: the task's own.
         interval_frames: steps between two evaluations.

@@ -20,7 +20,7 @@ class Evaluation:
         seed: of the training.
         frames: environment steps so far.
         seconds: wall time so far, evaluations included.
-        cpu_seconds: of the whole process; ``None``: not known.
+        cpu_seconds: processor time so far, evaluations included.
         episodes: number of them.
         return_mean: without the bonus.
         success_rate: share of episodes that complete the task.
@@ -35,7 +35,7 @@ class Evaluation:
     seed: int
     frames: int
     seconds: float
-    cpu_seconds: float | None
+    cpu_seconds: float
     episodes: int
     return_mean: float
     success_rate: float

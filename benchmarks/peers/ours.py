@@ -12,16 +12,18 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
-from math import inf
 from pathlib import Path
 from typing import Any
 
 from arguments import Arguments
-from evaluations import Evaluation, read, write
+from evaluations import Evaluation, write
 from tasks import settings_of_task
 
 ROOT = Path(__file__).parents[2]
+PAUSE = 1.0
+"""Seconds between two looks at the time that a run has used."""
 _STOPS = (signal.SIGTERM, signal.SIGINT)
 _WELL = (0, *(128 + stop for stop in _STOPS), *(-stop for stop in _STOPS))  # exit codes: done, stopped
 
@@ -68,29 +70,28 @@ def settings_of(arguments: OurArguments) -> list[str]:
     ]
 
 
-def train(arguments: OurArguments) -> float | None:
-    """Trains until frames or time are used up.
-
-    Returns:
-        Processor time; ``None`` if the run was begun before.
-    """
-    is_new, before = not arguments.folder.exists(), os.times()
-    left = arguments.seconds - max((float(row["wall_seconds"]) for row in rows_of(arguments.folder)), default=0.0)
-    if left <= 0:
-        return None
+def train(arguments: OurArguments) -> None:
+    """Trains until frames or time are used up."""
+    if spent(arguments.folder) >= arguments.seconds:
+        return
     words = [sys.executable, str(ROOT / "train.py"), *settings_of(arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(words, env=environment) as process:
         try:
-            process.wait(None if left == inf else left)
-        except (subprocess.TimeoutExpired, KeyboardInterrupt):
+            while process.poll() is None and spent(arguments.folder) < arguments.seconds:
+                time.sleep(PAUSE)
+        except KeyboardInterrupt:
+            pass
+        if process.poll() is None:
             process.send_signal(signal.SIGTERM)  # it saves first
             process.wait()
     if process.returncode not in _WELL:
         sys.exit(f"error: train.py ended with exit code {process.returncode}; see above.")
-    after = os.times()
-    spent = after.children_user + after.children_system - before.children_user - before.children_system
-    return spent if is_new else None
+
+
+def spent(folder: Path) -> float:
+    """Processor time up to the last log point."""
+    return max((float(row["processor_seconds"]) for row in rows_of(folder)), default=0.0)
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -102,12 +103,12 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def evaluations_of(arguments: OurArguments, cpu_seconds: float | None) -> list[Evaluation]:
+def evaluations_of(arguments: OurArguments) -> list[Evaluation]:
     """What a run folder tells, in the words of all peers."""
     found = [_evaluation(arguments, _figures(row)) for row in rows_of(arguments.folder) if row.get("greedy/return")]
     summary = arguments.folder / "summary.json"
     if summary.exists():
-        final = _evaluation(arguments, {**json.loads(summary.read_text()), "cpu_seconds": cpu_seconds})
+        final = _evaluation(arguments, json.loads(summary.read_text()))
         found = [each for each in found if each.frames < final.frames] + [final]
     return found
 
@@ -117,7 +118,7 @@ def _figures(row: dict[str, str]) -> dict[str, Any]:
     return {
         "frames": row["frames"],
         "wall_seconds": row["wall_seconds"],
-        "cpu_seconds": None,
+        "processor_seconds": row["processor_seconds"],
         "episodes": row["greedy/episodes"],
         "return_mean": row["greedy/return"],
         "success_rate": row["greedy/success"],
@@ -133,7 +134,7 @@ def _evaluation(arguments: OurArguments, figures: dict[str, Any]) -> Evaluation:
         seed=arguments.seed,
         frames=int(float(figures["frames"])),
         seconds=float(figures["wall_seconds"]),
-        cpu_seconds=figures["cpu_seconds"],
+        cpu_seconds=float(figures["processor_seconds"]),
         episodes=int(float(figures["episodes"])),
         return_mean=float(figures["return_mean"]),
         success_rate=float(figures["success_rate"]),
@@ -145,9 +146,8 @@ def main() -> None:
     """One run."""
     arguments = OurArguments.read(sys.argv[1:])
     path = arguments.results / f"{arguments.name_of(arguments.agent)}.jsonl"
-    known = [each.cpu_seconds for each in read(path)[-1:]]
-    spent = train(arguments)
-    write(path, evaluations_of(arguments, known[0] if known and spent is None else spent))
+    train(arguments)
+    write(path, evaluations_of(arguments))
 
 
 if __name__ == "__main__":

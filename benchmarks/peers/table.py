@@ -1,6 +1,6 @@
 """All results beside each other: ``python benchmarks/peers/table.py`` prints a table and draws ``peers.png``.
 
-Of each task, all agents at equal frames and at equal wall time: where the run that is the first to end has ended.
+Of each task, all agents at equal frames and at equal processor time: where the run that is the first to end has ended.
 Values between two evaluations are interpolated. Intervals are 95 % t intervals over seeds.
 """
 
@@ -22,7 +22,8 @@ from hdrqn_torchrl.analysis.intervals import mean_interval
 
 Run = list[Evaluation]
 Groups = dict[str, list[Run]]
-AXES = {"frames": "environment frames", "seconds": "seconds"}
+AXES = {"frames": "environment frames", "cpu_seconds": "seconds of processor time"}
+UNITS = {"frames": "frames", "cpu_seconds": "s"}
 FIGURES = {
     "success_rate": ("success", ".3f"),
     "return_mean": ("return", ".3f"),
@@ -58,7 +59,9 @@ def rows_of(task: str, groups: Groups) -> list[str]:
         end = shared_end(groups, axis)
         for agent, runs in groups.items():
             figures = [_cell(values_at(runs, axis, name, np.array([end])), form) for name, (_, form) in FIGURES.items()]
-            rows.append(" | ".join(["", task, f"{end:,.0f} {axis}", agent, str(len(runs)), *figures, ""]).strip())
+            rows.append(
+                " | ".join(["", task, f"{end:,.0f} {UNITS[axis]}", agent, str(len(runs)), *figures, ""]).strip()
+            )
     return rows
 
 

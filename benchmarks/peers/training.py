@@ -71,14 +71,13 @@ class Training(ABC):
 
     @property
     def cpu_seconds(self) -> float:
-        """Time of a processor."""
-        before = self._before.cpu_seconds if self._before else None
-        return (before or 0.0) + time.process_time() - self._cpu_started
+        """Processor time of the training so far."""
+        return (self._before.cpu_seconds if self._before else 0.0) + time.process_time() - self._cpu_started
 
     @property
     def is_over(self) -> bool:
         """Whether frames or time are used up."""
-        return self.frames >= self.arguments.frames or self.seconds >= self.arguments.seconds
+        return self.frames >= self.arguments.frames or self.cpu_seconds >= self.arguments.seconds
 
     def train(self) -> None:
         """Goes on until frames or time are used up, with evaluations in between."""

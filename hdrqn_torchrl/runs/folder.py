@@ -33,6 +33,7 @@ def write_summary(
         "updates": trainer.updates,
         "training_episodes": trainer.episodes,
         "wall_seconds": round(trainer.wall_seconds, 1),
+        "processor_seconds": round(trainer.processor_seconds, 1),
         "ceiling": ceiling,
     }
     write_whole(folder / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")

@@ -81,7 +81,7 @@ class Trainer:
         self._incoming = Incoming(self._tracker)
         self._window = Window()
         self._stop = stop or StopRequest()
-        self._started = time.monotonic()
+        self._started, self._processor_started = time.monotonic(), time.process_time()
         self._saving = Saving(checkpoints, self._parts, place=lambda: self._place, seconds=checkpoint_seconds)
 
     @property
@@ -93,6 +93,11 @@ class Trainer:
     def wall_seconds(self) -> float:
         """Seconds of training, interruptions left out."""
         return time.monotonic() - self._started
+
+    @property
+    def processor_seconds(self) -> float:
+        """Processor time of the process meanwhile, all its threads together; that of workers is not in it."""
+        return time.process_time() - self._processor_started
 
     @property
     def updates(self) -> int:
@@ -216,6 +221,7 @@ class Trainer:
             "episodes": self.episodes,
             "updates": self.updates,
             "wall_seconds": round(self.wall_seconds, 2),
+            "processor_seconds": round(self.processor_seconds, 2),
             **self._window.summary(self.frames),
             **self.algorithm.figures(),
         }
@@ -286,6 +292,7 @@ class Trainer:
             "best_return": self.best_return,
             "completed": self._completed,
             "wall_seconds": self.wall_seconds,
+            "processor_seconds": self.processor_seconds,
             "tracker": self._tracker.state_dict(),
             "window": self._window.state_dict(),
         }
@@ -300,5 +307,6 @@ class Trainer:
         self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
         self._completed = state["completed"]
         self._started = time.monotonic() - state["wall_seconds"]
+        self._processor_started = time.process_time() - state["processor_seconds"]
         self._tracker.load_state_dict(state["tracker"])
         self._window.load_state_dict(state["window"])

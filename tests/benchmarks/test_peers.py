@@ -22,9 +22,9 @@ TASK = "MiniGrid-DoorKey-8x8-v0"
 
 def evaluation(frames, success, *, seed=0, agent="v3_flat", bonus=1.0, seconds=None, sampled=None):
     return Evaluation(
-        agent=agent, id=TASK, bonus=bonus, seed=seed, frames=frames, seconds=seconds or frames / 100, cpu_seconds=None,
-        episodes=10, return_mean=success / 2, success_rate=success, steps_mean=640 * (1 - success),
-        sampled_success_rate=sampled,
+        agent=agent, id=TASK, bonus=bonus, seed=seed, frames=frames, seconds=frames / 50,
+        cpu_seconds=seconds or frames / 100, episodes=10, return_mean=success / 2, success_rate=success,
+        steps_mean=640 * (1 - success), sampled_success_rate=sampled,
     )  # fmt: skip
 
 
@@ -88,29 +88,29 @@ class TestOurs:
     def test_a_run_folder_becomes_evaluations(self, tmp_path):
         arguments = OurArguments(id=TASK, runs=tmp_path, bonus=1.0)
         arguments.folder.mkdir()
-        columns = "frames,wall_seconds,greedy/return,greedy/success,greedy/steps,greedy/episodes"
-        rows = ["0,1.5,0.0,0.0,640.0,100", "10,5.0,,,,", "50,90.0,0.4,0.5,320.0,100", "80,150.0,0.4,0.5,320.0,100"]
+        columns = "frames,wall_seconds,processor_seconds,greedy/return,greedy/success,greedy/steps,greedy/episodes"
+        rows = ["0,1.5,1,0.0,0.0,640,100", "10,5.0,4,,,,", "50,90.0,60,0.4,0.5,320,100", "80,150.0,99,0.4,0.5,320,100"]
         (arguments.folder / "metrics.csv").write_text("\n".join([columns, *rows]) + "\n")
-        found = ours.evaluations_of(arguments, 60.0)
-        assert [(each.frames, each.success_rate, each.cpu_seconds) for each in found[:2]] == [
-            (0, 0, None),
-            (50, 0.5, None),
-        ]
+        found = ours.evaluations_of(arguments)
+        assert [(each.frames, each.success_rate, each.cpu_seconds) for each in found[:2]] == [(0, 0, 1), (50, 0.5, 60)]
         summary = {"frames": 80, "wall_seconds": 180.0, "episodes": 500, "return_mean": 0.7, "success_rate": 0.75}
+        summary["processor_seconds"] = 120.0
         (arguments.folder / "summary.json").write_text(json.dumps(summary | {"steps_mean": 200.0}))
-        final = ours.evaluations_of(arguments, 60.0)[-1]
-        assert (final.frames, final.episodes, final.success_rate, final.cpu_seconds) == (80, 500, 0.75, 60.0)
-        assert len(ours.evaluations_of(arguments, None)) == 3 and final.sampled_success_rate is None
+        final = ours.evaluations_of(arguments)[-1]
+        assert (final.frames, final.episodes, final.success_rate, final.cpu_seconds) == (80, 500, 0.75, 120.0)
+        assert len(ours.evaluations_of(arguments)) == 3 and final.sampled_success_rate is None
 
     @pytest.mark.parametrize("code", [0, 143, -15, 1])
     def test_a_run_that_is_stopped_is_no_error_and_one_that_fails_is(self, tmp_path, monkeypatch, code):
         signals = []
 
         class Process:
-            returncode = code
+            returncode = None
 
             def __init__(self, words, env):
                 assert words[1].endswith("train.py") and env["OMP_NUM_THREADS"] == "1"
+                arguments.folder.mkdir()
+                (arguments.folder / "metrics.csv").write_text("frames,processor_seconds\n10,101.0\n")
 
             def __enter__(self):
                 return self
@@ -118,9 +118,11 @@ class TestOurs:
             def __exit__(self, *_):
                 pass
 
-            def wait(self, timeout=None):
-                if timeout is not None:
-                    raise ours.subprocess.TimeoutExpired("train.py", timeout)
+            def poll(self):
+                return self.returncode
+
+            def wait(self):
+                self.returncode = code
 
             def send_signal(self, number):
                 signals.append(number)
@@ -131,15 +133,15 @@ class TestOurs:
             with pytest.raises(SystemExit, match=r"train\.py ended with exit code 1"):
                 ours.train(arguments)
         else:
-            assert ours.train(arguments) is not None
+            ours.train(arguments)
         assert signals == [ours.signal.SIGTERM]
 
     def test_time_that_was_used_up_starts_nothing(self, tmp_path, monkeypatch):
         arguments = OurArguments(id=TASK, runs=tmp_path, seconds=100.0)
         arguments.folder.mkdir()
-        (arguments.folder / "metrics.csv").write_text("frames,wall_seconds\n10,101.0\n")
+        (arguments.folder / "metrics.csv").write_text("frames,processor_seconds\n10,101.0\n")
         monkeypatch.setattr(ours.subprocess, "Popen", None)
-        assert ours.train(arguments) is None
+        ours.train(arguments)
 
 
 class TestTable:
@@ -159,8 +161,8 @@ class TestTable:
         assert [row[:3] for row in rows] == [
             ["100 frames", "v3_flat, bonus 1", "2"],
             ["100 frames", "recurrent_ppo, bonus 1", "1"],
-            ["2 seconds", "v3_flat, bonus 1", "2"],
-            ["2 seconds", "recurrent_ppo, bonus 1", "1"],
+            ["2 s", "v3_flat, bonus 1", "2"],
+            ["2 s", "recurrent_ppo, bonus 1", "1"],
         ]
         assert [row[3] for row in rows] == ["0.450 (-0.185 to 1.085)", "0.200", "0.900 (-0.371 to 2.171)", "0.050"]
 

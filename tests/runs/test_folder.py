@@ -11,7 +11,7 @@ from processes import start
 from hdrqn_torchrl.runs.folder import locked, write_summary
 
 RESULT = {"return_mean": 0.5, "success_rate": 0.25, "in_order_rate": 0.4, "steps_mean": 40.0, "episodes": 100}
-TRAINER = SimpleNamespace(frames=2_000, updates=30, episodes=50, wall_seconds=12.3456)
+TRAINER = SimpleNamespace(frames=2_000, updates=30, episodes=50, wall_seconds=12.3456, processor_seconds=9.876)
 
 
 @pytest.fixture
@@ -25,6 +25,7 @@ def test_the_summary_holds_result_counts_and_ceiling(folder):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary == returned
     expected = {"frames": 2_000, "updates": 30, "training_episodes": 50, "wall_seconds": 12.3, "ceiling": 1.9}
+    expected |= {"processor_seconds": 9.9}
     assert summary == RESULT | expected
     assert {path.name for path in folder.iterdir()} == {"metrics.csv", "summary.json"}
 
