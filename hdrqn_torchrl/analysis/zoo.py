@@ -60,7 +60,15 @@ def disagreement(card: Card, scored: dict[str, Any]) -> list[str]:
     return found
 
 
-def add_agent(run: Path, zoo: Path, name: str, *, episodes: int = 500, allowed_targets: Sequence[str] = ()) -> Card:
+def add_agent(
+    run: Path,
+    zoo: Path,
+    name: str,
+    *,
+    checkpoint: str = "best",
+    episodes: int = 500,
+    allowed_targets: Sequence[str] = (),
+) -> Card:
     """Makes an agent of a run.
 
     Weights are rounded to 16 bits if the greedy figures in the same worlds then stay within the intervals of those of
@@ -70,11 +78,12 @@ def add_agent(run: Path, zoo: Path, name: str, *, episodes: int = 500, allowed_t
         run: run folder.
         zoo: folder of agents.
         name: of the new one; an old one of this name is replaced.
+        checkpoint: ``"best"``, ``"last"``, or the path of one.
         episodes: greedy episodes of its figures.
         allowed_targets: builders of your own that the run may name.
     """
     origin, summary = read_json(run / layout.ORIGIN), read_json(run / layout.SUMMARY)  # before minutes of play
-    agent = load_agent(run, num_envs=WORLDS, allowed_targets=allowed_targets)
+    agent = load_agent(run, checkpoint=checkpoint, num_envs=WORLDS, allowed_targets=allowed_targets)
     seed = agent.config.evaluation.seed + 1
     full = score(agent, episodes=episodes, seed=seed)
     zoo.mkdir(parents=True, exist_ok=True)

@@ -3,15 +3,15 @@
     python zoo.py list
     python zoo.py get NAME [out=FOLDER]
     python zoo.py watch NAME [out=episode.gif] [episodes=3] [seed=0]
-    python zoo.py add NAME run=RUN_DIR [episodes=500]
+    python zoo.py add NAME run=RUN_DIR [episodes=500] [checkpoint=best]
     python zoo.py page [out=docs/zoo.md]
 
 list    what there is: task, algorithm, greedy figures with 95 % intervals over episodes
 get     copies an agent to a folder of its own (default: its name), which evaluate, watch, export and init_from take as
         run=FOLDER, init_from=FOLDER/weights.safetensors
 watch   records episodes, as watch.py does; out=terminal shows them at once
-add     makes an agent of a run: its best weights (of 16 bits, if the greedy figures stay what they are), its settings,
-        play.gif, and a card with the figures
+add     makes an agent of a run: its best weights, or with checkpoint=last its last (of 16 bits, if the greedy figures
+        stay what they are), its settings, play.gif, and a card with the figures
 page    writes the table of all agents, with their pictures, into a page, between marks (default: docs/zoo.md beside
         the folder of the agents)
 
@@ -52,6 +52,7 @@ class Settings:
     zoo: str = str(FOLDER)
     out: str | None = None
     run: str | None = None
+    checkpoint: str = "best"
     episodes: int | None = None
     seed: int = 0
     allowed_targets: list[str] = field(default_factory=list)
@@ -127,6 +128,7 @@ def add(settings: Settings) -> None:
             Path(settings.run),
             zoo,
             settings.name,
+            checkpoint=settings.checkpoint,
             episodes=settings.episodes or 500,
             allowed_targets=settings.allowed_targets,
         )

@@ -63,6 +63,17 @@ def test_an_agent_is_a_run_with_weights_of_16_bits_in_place_of_checkpoints(agent
     assert all(torch.equal(value, stored[name].to(value.dtype)) for name, value in policy.state_dict().items())
 
 
+def test_an_agent_can_have_the_last_weights_instead_of_the_best(agents, tmp_path):
+    stored = {}
+    for checkpoint in ("best", "last"):
+        run = agents.parent / "run"
+        call("add", checkpoint, f"run={run}", f"zoo={tmp_path}", "episodes=2", f"checkpoint={checkpoint}")
+        stored[checkpoint] = load_file(tmp_path / checkpoint / "weights.safetensors")
+        weights = load_agent(run, checkpoint=checkpoint).algorithm.policy.state_dict()
+        assert all(torch.equal(weights[name].to(value.dtype), value) for name, value in stored[checkpoint].items())
+    assert any(not torch.equal(value, stored["last"][name]) for name, value in stored["best"].items())
+
+
 def test_settings_of_an_agent_say_nothing_of_the_machine_that_it_was_trained_on(agents):
     assert (
         str(agents.parent)
