@@ -91,7 +91,7 @@ def train(arguments: OurArguments) -> None:
 
 def spent(folder: Path) -> float:
     """Processor time up to the last log point."""
-    return max((float(row["processor_seconds"]) for row in rows_of(folder)), default=0.0)
+    return max((float(row.get("processor_seconds") or 0.0) for row in rows_of(folder)), default=0.0)
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

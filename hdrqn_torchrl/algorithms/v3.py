@@ -141,7 +141,7 @@ def make_v3(
     own = discovered_set(discovery.max_subgoals) if finds else None
     has = check_environment(env, architecture, builder="make_v3", levels=levels, discovered=own)
     learner = with_sequences(learner.lasting(total_frames), has.task)
-    turns = symmetries_of(has.task, learner, finds_subgoals=finds) if symmetries else ()
+    turns = symmetries_of(has, learner) if symmetries else ()
     sub_exploration = sub_exploration or presets.v3_sub_exploration()
     meta_exploration = meta_exploration or presets.meta_exploration()
     policy = AllSubgoalsPolicy(

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import replace
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.algorithms.requirements import Requirements
 from hdrqn_torchrl.data import FROM_STARTS
 from hdrqn_torchrl.envs import Symmetry, Task
 from hdrqn_torchrl.learning import LearnerSettings, RandomSymmetry
@@ -63,19 +64,19 @@ def with_sequences(learner: LearnerSettings, task: Task) -> LearnerSettings:
     return replace(learner, slice_len=SHORT_SEQUENCE, sampling="steps", stored_state=True, burn_in=0.25)
 
 
-def symmetries_of(task: Task, learner: LearnerSettings, *, finds_subgoals: bool) -> tuple[Symmetry, ...]:
+def symmetries_of(has: Requirements, learner: LearnerSettings) -> tuple[Symmetry, ...]:
     """The ways to turn and mirror the task's worlds, if an agent may use them.
 
     Raises:
-        ValueError: if the task states none, sequences have states that were computed as worlds were, or subgoals may be
-            of places.
+        ValueError: if the task states none, or those of other observations or actions; if sequences have states that
+            were computed as worlds were; or if subgoals may be of places.
     """
-    if finds_subgoals:
+    if has.finds_subgoals:
         raise ValueError(
             "symmetries must be False with subgoals='discovered', got True: what happens at a place is another event "
             "in a turned world."
         )
-    if not task.symmetries:
+    if not has.task.symmetries:
         raise ValueError(
             "symmetries must be False for a task that states none, got True; an environment states them in its task."
         )
@@ -84,7 +85,14 @@ def symmetries_of(task: Task, learner: LearnerSettings, *, finds_subgoals: bool)
             "symmetries must be False with learner.stored_state=True, got True: the stored states are of what was seen "
             "as it was; use sequences from the start of episodes."
         )
-    return task.symmetries
+    first = has.task.symmetries[0]
+    stated, sizes = (len(first.places), len(first.actions)), (has.observation.shape[1:].numel(), has.num_actions)
+    if stated != sizes:
+        raise ValueError(
+            f"symmetries must be of the observation's {sizes[0]} places and of {sizes[1]} actions, got a task that "
+            f"states those of {stated[0]} and {stated[1]}; state them for what the agent sees and does."
+        )
+    return has.task.symmetries
 
 
 def random_symmetry(symmetries: tuple[Symmetry, ...], policy: AllSubgoalsPolicy) -> RandomSymmetry | None:

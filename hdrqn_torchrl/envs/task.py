@@ -228,7 +228,7 @@ def _with_subgoals(task: Task, critic: Critic) -> Task:
     sets = [own if each.prefix == own.prefix else each for each in task.subgoals]
     if own not in sets:
         sets = [own, *sets] if own.prefix else [*sets, own]
-    return replace(task, subgoals=tuple(sets))
+    return replace(task, subgoals=tuple(sets), symmetries=())  # it may look at places
 
 
 def _task_of_worker(env: BatchedEnvBase) -> Task:

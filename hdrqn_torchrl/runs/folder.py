@@ -32,8 +32,7 @@ def write_summary(
         "frames": trainer.frames,
         "updates": trainer.updates,
         "training_episodes": trainer.episodes,
-        "wall_seconds": round(trainer.wall_seconds, 1),
-        "processor_seconds": round(trainer.processor_seconds, 1),
+        **{name: round(seconds, 1) for name, seconds in trainer.clock.state_dict().items()},
         "ceiling": ceiling,
     }
     write_whole(folder / layout.SUMMARY, json.dumps(summary, indent=2) + "\n")

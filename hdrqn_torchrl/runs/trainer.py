@@ -7,7 +7,6 @@ learners draws from its own.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from hdrqn_torchrl.learning import Monitor
 from hdrqn_torchrl.learning.finite import NonFiniteError, naming
 from hdrqn_torchrl.runs.captured_collector import CapturedCollector
 from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
+from hdrqn_torchrl.runs.clock import Clock
 from hdrqn_torchrl.runs.components import components_of
 from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.incoming import Incoming
@@ -81,23 +81,13 @@ class Trainer:
         self._incoming = Incoming(self._tracker)
         self._window = Window()
         self._stop = stop or StopRequest()
-        self._started, self._processor_started = time.monotonic(), time.process_time()
+        self.clock = Clock()
         self._saving = Saving(checkpoints, self._parts, place=lambda: self._place, seconds=checkpoint_seconds)
 
     @property
     def _reporting(self) -> list[Monitor | WorkersCollector]:
         workers = [self.collector] if isinstance(self.collector, WorkersCollector) else []
         return [*self.algorithm.monitors.values(), *workers]
-
-    @property
-    def wall_seconds(self) -> float:
-        """Seconds of training, interruptions left out."""
-        return time.monotonic() - self._started
-
-    @property
-    def processor_seconds(self) -> float:
-        """Processor time of the process meanwhile, all its threads together; that of workers is not in it."""
-        return time.process_time() - self._processor_started
 
     @property
     def updates(self) -> int:
@@ -220,8 +210,7 @@ class Trainer:
             "frames": self.frames,
             "episodes": self.episodes,
             "updates": self.updates,
-            "wall_seconds": round(self.wall_seconds, 2),
-            "processor_seconds": round(self.processor_seconds, 2),
+            **{name: round(seconds, 2) for name, seconds in self.clock.state_dict().items()},
             **self._window.summary(self.frames),
             **self.algorithm.figures(),
         }
@@ -291,8 +280,7 @@ class Trainer:
             "episodes": self.episodes,
             "best_return": self.best_return,
             "completed": self._completed,
-            "wall_seconds": self.wall_seconds,
-            "processor_seconds": self.processor_seconds,
+            **self.clock.state_dict(),
             "tracker": self._tracker.state_dict(),
             "window": self._window.state_dict(),
         }
@@ -306,7 +294,6 @@ class Trainer:
         check_counters(state)
         self.frames, self.episodes, self.best_return = state["frames"], state["episodes"], state["best_return"]
         self._completed = state["completed"]
-        self._started = time.monotonic() - state["wall_seconds"]
-        self._processor_started = time.process_time() - state["processor_seconds"]
+        self.clock.load_state_dict(state)
         self._tracker.load_state_dict(state["tracker"])
         self._window.load_state_dict(state["window"])

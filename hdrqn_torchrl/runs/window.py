@@ -115,7 +115,7 @@ def check_counters(state: dict[str, Any]) -> None:
     """
     window, sums = state["window"], state["tracker"]["sums"]
     counts = [state["frames"], state["episodes"], window["frames"], state["completed"] or 0, *window["counts"].values()]
-    times = [state["wall_seconds"], state["processor_seconds"], window["seconds"]]
+    times = [state["wall_seconds"], state.get("processor_seconds", 0.0), window["seconds"]]
     possible = all(type(count) is int and 0 <= count < _MOST for count in counts)
     possible &= all(isinstance(each, (int, float)) and 0 <= each < _MOST for each in times)
     possible &= isinstance(state["best_return"], float) and state["best_return"] < math.inf

@@ -1,5 +1,7 @@
 """Sequences as they would be in changed worlds."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import small_env
@@ -63,6 +65,12 @@ def test_a_symmetry_is_made_of_permutations(symmetry, argument):
 def test_v3_refuses_symmetries_that_would_not_hold():
     with pytest.raises(ValueError, match=r"^symmetries must be False for a task that states none"):
         make_v3(small_env(2, layout=["######", "#    #", "#   ##", "######"]), compact_network(), symmetries=True)
+    env = small_env(2)
+    env.task = replace(env.task, symmetries=(MIRROR,))
+    with pytest.raises(
+        ValueError, match=r"^symmetries must be of the observation's 9 places and of 4 actions, .* 6 and 3"
+    ):
+        make_v3(env, compact_network(), symmetries=True)
     stored = {**vars(V3_LEARNER), "stored_state": True, "sampling": "steps", "slice_len": 8}
     with pytest.raises(ValueError, match=r"^symmetries must be False with learner.stored_state=True"):
         make_v3(small_env(2), compact_network(), symmetries=True, learner=type(V3_LEARNER)(**stored))

@@ -11,7 +11,8 @@ from processes import start
 from hdrqn_torchrl.runs.folder import locked, write_summary
 
 RESULT = {"return_mean": 0.5, "success_rate": 0.25, "in_order_rate": 0.4, "steps_mean": 40.0, "episodes": 100}
-TRAINER = SimpleNamespace(frames=2_000, updates=30, episodes=50, wall_seconds=12.3456, processor_seconds=9.876)
+CLOCK = SimpleNamespace(state_dict=lambda: {"wall_seconds": 12.3456, "processor_seconds": 9.876})
+TRAINER = SimpleNamespace(frames=2_000, updates=30, episodes=50, clock=CLOCK)
 
 
 @pytest.fixture

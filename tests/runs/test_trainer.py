@@ -1,4 +1,5 @@
 import signal
+import time
 import warnings
 
 import pytest
@@ -8,7 +9,6 @@ from tensordict import TensorDict
 from torch import nn
 
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.runs import trainer as trainer_module
 from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.interruption import Interrupted
 from hdrqn_torchrl.runs.trainer import Trainer, crossed
@@ -232,7 +232,7 @@ class TestWhenItSaves:
     def saved(self, tmp_path, monkeypatch):
         """Steps (with scores, if best) of the checkpoints of a training."""
         clock = [0.0]
-        monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
+        monkeypatch.setattr(time, "monotonic", lambda: clock[0])
 
         def saved(*, results=(), seconds_per_batch=0.0, at=None, error=None, **settings):
             def tick():
@@ -356,8 +356,8 @@ class TestStopRequests:
 
 def test_the_clocks_of_a_training_stand_still_while_it_is_stopped(tmp_path, monkeypatch):
     clock = [5.0]
-    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(trainer_module.time, "process_time", lambda: clock[0] / 2)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(time, "process_time", lambda: clock[0] / 2)
 
     def take_a_second():
         clock[0] += 1.0
@@ -378,9 +378,12 @@ def test_the_clocks_of_a_training_stand_still_while_it_is_stopped(tmp_path, monk
     clock[0] += 1_000
     second = make({})
     second.resume(second.checkpoints.newest())
-    assert second.wall_seconds == 4.0
+    assert second.clock.wall_seconds == 4.0
     second.train()
     rows = second.logger.rows
+    old = second.state_dict()
+    del old["processor_seconds"]
+    make({}).load_state_dict(old)  # of a version that did not store it
     figures = ("frames", "wall_seconds", "processor_seconds", "frames_per_second")
     assert [tuple(row[name] for name in figures) for row in rows] == [(50, 5.0, 2.5, 10.0), (100, 10.0, 5.0, 10.0)]
 

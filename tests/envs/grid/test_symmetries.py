@@ -2,10 +2,13 @@
 
 import pytest
 import torch
+from helpers import small_env
+from torchrl.envs import TransformedEnv
 
 from hdrqn_torchrl.envs import MultiGoalGridEnv, task_of
 from hdrqn_torchrl.envs.grid.layouts import map_rows
 from hdrqn_torchrl.envs.grid.symmetries import _changes, grid_symmetries
+from hdrqn_torchrl.transforms import Critic
 
 RECTANGLE = ["#####", "#   #", "#####"]
 
@@ -43,6 +46,11 @@ def play(env, agent, objects, actions):
         steps.append(step.select("observation", "reward", "attained", "terminated"))
         step = step.exclude("reward")
     return torch.stack(steps)
+
+
+def test_nothing_is_known_of_symmetries_behind_a_critic_which_may_look_at_places():
+    critic = Critic(2, lambda after: after["observation"][..., 0, :2] == 1)
+    assert task_of(TransformedEnv(small_env(2), critic)).symmetries == ()
 
 
 def test_places_have_no_symmetries_as_subgoals_would_change_too():
