@@ -22,6 +22,9 @@ from evaluations import Evaluation, write
 from tasks import settings_of_task
 
 ROOT = Path(__file__).parents[2]
+LONG_EXPLORATION = ("algo.sub_exploration.anneal_frames=400_000", "algo.meta_exploration.anneal_frames=800_000")
+SETTINGS_OF_TASKS = {"BabyAI-KeyCorridorS3R3-v0": LONG_EXPLORATION}
+"""What ``train.py`` is told beside the settings of ``conf/``; docs/minigrid.md says why."""
 PAUSE = 1.0
 """Seconds between two looks at the time that a run has used."""
 _STOPS = (signal.SIGTERM, signal.SIGINT)
@@ -56,6 +59,7 @@ def settings_of(arguments: OurArguments) -> list[str]:
         "algo=v3",
         f"algo.levels={arguments.levels}",
         f"algo.bonus_reward={arguments.bonus}",
+        *SETTINGS_OF_TASKS.get(arguments.id, ()),
         f"seed={arguments.seed}",
         f"total_frames={arguments.frames}",
         "device=cpu",

@@ -85,6 +85,15 @@ class TestOurs:
         _, algorithm = build_algorithm(resolved(config))
         assert len(algorithm.levels) == levels
 
+    @pytest.mark.parametrize("levels", [1, 2])
+    @pytest.mark.parametrize("task", ours.SETTINGS_OF_TASKS)
+    def test_settings_of_a_task_come_beside_those_of_all(self, task, levels):
+        with initialize_config_dir(CONF, version_base="1.3"):
+            plain, own = (
+                compose("config", overrides=ours.settings_of(OurArguments(id=id, levels=levels))) for id in (TASK, task)
+            )
+        assert own.algo.sub_exploration.anneal_frames > plain.algo.sub_exploration.anneal_frames
+
     def test_a_run_folder_becomes_evaluations(self, tmp_path):
         arguments = OurArguments(id=TASK, runs=tmp_path, bonus=1.0)
         arguments.folder.mkdir()
