@@ -1,6 +1,6 @@
-"""All results beside each other: ``python benchmarks/peers/table.py`` prints a table and draws ``peers.png``.
+"""All results beside each other: ``python benchmarks/peers/table.py`` writes tables and a figure into docs/peers.md.
 
-Of each task, all agents at equal frames and at equal processor time: where the run that is the first to end has ended.
+Of each task, all agents at equal processor time and at equal frames: where the run that is the first to end has ended.
 Values between two evaluations are interpolated. Intervals are 95 % t intervals over seeds.
 """
 
@@ -19,26 +19,41 @@ from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from hdrqn_torchrl.analysis.intervals import mean_interval
+from hdrqn_torchrl.cli.marks import put
 
 Run = list[Evaluation]
 Groups = dict[str, list[Run]]
-AXES = {"frames": "environment frames", "cpu_seconds": "seconds of processor time"}
-UNITS = {"frames": "frames", "cpu_seconds": "s"}
+AXES = {"cpu_seconds": "seconds of processor time", "frames": "environment frames"}
+UNITS = {"cpu_seconds": "s", "frames": "frames"}
 FIGURES = {
-    "success_rate": ("success", ".3f"),
-    "return_mean": ("return", ".3f"),
+    "return_mean": ("return", ".2f"),
+    "success_rate": ("success", ".2f"),
     "steps_mean": ("steps", ".1f"),
-    "sampled_success_rate": ("success, actions drawn", ".3f"),
+    "sampled_success_rate": ("success, actions drawn", ".2f"),
 }
+PANELS = (("return_mean", "cpu_seconds"), ("success_rate", "cpu_seconds"), ("success_rate", "frames"))
+AGENTS = {
+    "v3_2_levels": "hDRQNv3",
+    "v3_flat": "v3 without hierarchy",
+    "recurrent_ppo": "RecurrentPPO (sb3-contrib)",
+    "xuance_drqn": "DRQN (XuanCe)",
+}
+PAGE, FIGURE = (Path(__file__).parents[2] / "docs" / name for name in ("peers.md", "peers.png"))
 
 
 def read_all(folder: Path) -> dict[str, Groups]:
-    """Runs by task, and by agent and bonus."""
+    """Runs by task, and by agent and bonus: ours first, the others as :data:`AGENTS` has them."""
     tasks: dict[str, Groups] = defaultdict(lambda: defaultdict(list))
-    for path in sorted(folder.glob("*.jsonl")):
-        if run := read(path):
-            tasks[run[0].id][f"{run[0].agent}, bonus {run[0].bonus:g}"].append(run)
-    return tasks
+    runs = [run for path in sorted(folder.glob("*.jsonl")) if (run := read(path))]
+    for run in sorted(runs, key=lambda run: (list(AGENTS).index(run[0].agent), -run[0].bonus)):
+        tasks[run[0].id][label_of(run[0])].append(run)
+    return {task: tasks[task] for task in sorted(tasks)}
+
+
+def label_of(evaluation: Evaluation) -> str:
+    """What the agent is called, and whether it was told of subgoals by a bonus."""
+    name = AGENTS[evaluation.agent]
+    return name if evaluation.agent == "v3_2_levels" else f"{name}, {'bonus' if evaluation.bonus else 'no bonus'}"
 
 
 def values_at(runs: Sequence[Run], axis: str, figure: str, places: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,17 +67,30 @@ def shared_end(groups: Groups, axis: str) -> float:
     return min(getattr(run[-1], axis) for runs in groups.values() for run in runs)
 
 
-def rows_of(task: str, groups: Groups) -> list[str]:
-    """Rows of the table in Markdown, one for each agent and axis."""
+def table_of(tasks: dict[str, Groups], axis: str) -> str:
+    """A table in Markdown: all agents at equal time or frames, one row for each."""
+    head = ["task", "at", "agent", "seeds", *(name for name, _ in FIGURES.values())]
+    return "\n".join(
+        [
+            _row(head),
+            "|---" * len(head) + "|",
+            *(row for task, groups in tasks.items() for row in rows_of(task, groups, axis)),
+        ]
+    )
+
+
+def rows_of(task: str, groups: Groups, axis: str) -> list[str]:
+    """Those of a task."""
+    end = shared_end(groups, axis)
     rows = []
-    for axis in AXES:
-        end = shared_end(groups, axis)
-        for agent, runs in groups.items():
-            figures = [_cell(values_at(runs, axis, name, np.array([end])), form) for name, (_, form) in FIGURES.items()]
-            rows.append(
-                " | ".join(["", task, f"{end:,.0f} {UNITS[axis]}", agent, str(len(runs)), *figures, ""]).strip()
-            )
+    for agent, runs in groups.items():
+        figures = [_cell(values_at(runs, axis, name, np.array([end])), form) for name, (_, form) in FIGURES.items()]
+        rows.append(_row([f"`{task}`", f"{end:,.0f} {UNITS[axis]}", agent, str(len(runs)), *figures]))
     return rows
+
+
+def _row(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cells)} |"
 
 
 def _cell(values: NDArray[np.float64], form: str) -> str:
@@ -73,45 +101,46 @@ def _cell(values: NDArray[np.float64], form: str) -> str:
 
 
 def draw(tasks: dict[str, Groups], path: Path) -> None:
-    """Success of all agents over frames and over seconds, a row for each task; dashed: with actions drawn."""
-    figure = Figure(figsize=(10, 3.4 * len(tasks)), layout="constrained")
-    panels = figure.subplots(len(tasks), len(AXES), squeeze=False, sharey=True)
+    """Return and success of all agents over seconds, success over frames, a row for each task."""
+    figure = Figure(figsize=(14, 3.4 * len(tasks)), layout="constrained")
+    panels = figure.subplots(len(tasks), len(PANELS), squeeze=False)
     for row, (task, groups) in zip(panels, tasks.items(), strict=True):
-        for panel, axis in zip(row, AXES, strict=True):
+        for panel, (name, axis) in zip(row, PANELS, strict=True):
             for agent, runs in groups.items():
-                _curve(panel, runs, axis, agent)
-            panel.set(xlabel=AXES[axis], title=task, ylim=(-0.03, 1.03))
+                _curve(panel, runs, axis, name, agent)
+            panel.set(xlabel=AXES[axis], ylabel=f"{FIGURES[name][0]} of greedy episodes", title=task)
             panel.xaxis.set_major_formatter(EngFormatter(sep=""))
             panel.grid(alpha=0.3)
-        row[0].set(ylabel="share of greedy episodes that succeed")
-        row[0].legend()
-    figure.savefig(path, dpi=110)
+        row[0].legend(fontsize="small")
+    figure.savefig(path, dpi=90)
 
 
-def _curve(panel: Axes, runs: Sequence[Run], axis: str, label: str) -> None:
-    """The mean over seeds, as far as all of them go, with its interval."""
+def _curve(panel: Axes, runs: Sequence[Run], axis: str, name: str, label: str) -> None:
+    """The mean over seeds, as far as all of them go, with its interval; success dashed where actions are drawn."""
     places = np.linspace(0.0, min(getattr(run[-1], axis) for run in runs), 100)
-    values, sampled = (values_at(runs, axis, name, places) for name in ("success_rate", "sampled_success_rate"))
+    values = values_at(runs, axis, name, places)
     (line,) = panel.plot(places, values.mean(-1), label=label)
-    panel.plot(places, sampled.mean(-1), "--", color=line.get_color(), linewidth=1)
     panel.fill_between(places, *mean_interval(values), color=line.get_color(), alpha=0.2)
+    if name == "success_rate":
+        sampled = values_at(runs, axis, "sampled_success_rate", places)
+        panel.plot(places, sampled.mean(-1), "--", color=line.get_color(), linewidth=1)
 
 
 def main() -> None:
-    """Reads, prints, draws."""
+    """Reads, draws, writes."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--results", type=Path, default=Path(__file__).parent / "results")
-    parser.add_argument("--figure", type=Path, default=Path("outputs/peers/peers.png"))
+    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--figure", type=Path, default=FIGURE)
     arguments = parser.parse_args()
     tasks = read_all(arguments.results)
     if not tasks:
         parser.error(f"--results must be a folder with results (*.jsonl), got {arguments.results}.")
-    print("| task | at | agent | seeds |", " | ".join(name for name, _ in FIGURES.values()), "|")
-    print("|---" * (4 + len(FIGURES)) + "|")
-    for task, groups in tasks.items():
-        print("\n".join(rows_of(task, groups)))
-    arguments.figure.parent.mkdir(parents=True, exist_ok=True)
+    text = arguments.page.read_text()
+    for axis, mark in (("cpu_seconds", "at equal time"), ("frames", "at equal frames")):
+        text = put(text, mark, table_of(tasks, axis))
     draw(tasks, arguments.figure)
+    arguments.page.write_text(text)
 
 
 if __name__ == "__main__":

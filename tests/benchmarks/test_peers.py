@@ -164,31 +164,46 @@ class TestTable:
         )
         return tmp_path
 
-    def test_agents_are_compared_where_the_first_run_ended(self, results):
-        groups = table.read_all(results)[TASK]
-        rows = [[cell.strip() for cell in row.split("|")][2:6] for row in table.rows_of(TASK, groups)]
-        assert [row[:3] for row in rows] == [
-            ["100 frames", "v3_flat, bonus 1", "2"],
-            ["100 frames", "recurrent_ppo, bonus 1", "1"],
-            ["2 s", "v3_flat, bonus 1", "2"],
-            ["2 s", "recurrent_ppo, bonus 1", "1"],
+    @pytest.mark.parametrize(
+        ("axis", "end", "returns"),
+        [
+            ("frames", "100 frames", ["0.23 (-0.09 to 0.54)", "0.10"]),
+            ("cpu_seconds", "2 s", ["0.45 (-0.19 to 1.09)", "0.03"]),
+        ],
+    )
+    def test_agents_are_compared_where_the_first_run_ended(self, results, axis, end, returns):
+        rows = table.rows_of(TASK, table.read_all(results)[TASK], axis)
+        cells = [[cell.strip() for cell in row.split("|")][2:6] for row in rows]
+        assert [row[:3] for row in cells] == [
+            [end, "v3 without hierarchy, bonus", "2"],
+            [end, "RecurrentPPO (sb3-contrib), bonus", "1"],
         ]
-        assert [row[3] for row in rows] == ["0.450 (-0.185 to 1.085)", "0.200", "0.900 (-0.371 to 2.171)", "0.050"]
+        assert [row[3] for row in cells] == returns
+
+    def test_agents_without_probabilities_have_no_success_with_drawn_actions(self, results):
+        rows = table.rows_of(TASK, table.read_all(results)[TASK], "frames")
+        assert [row.split("|")[8].strip() for row in rows] == ["-", "0.40"]
 
     def test_the_figure_has_a_curve_for_each_agent_and_an_interval_where_there_are_seeds(self, results, figures):
         table.draw(table.read_all(results), results / "peers.png")
-        frames, seconds = figures[0].axes
-        assert [text.get_text() for text in frames.get_legend().get_texts()] == [
-            "v3_flat, bonus 1",
-            "recurrent_ppo, bonus 1",
+        returns, seconds, frames = figures[0].axes
+        assert [text.get_text() for text in returns.get_legend().get_texts()] == [
+            "v3 without hierarchy, bonus",
+            "RecurrentPPO (sb3-contrib), bonus",
         ]
-        assert [row.split("|")[8].strip() for row in table.rows_of(TASK, table.read_all(results)[TASK])] == [
-            "-",
-            "0.400",
-            "-",
-            "0.100",
-        ]
-        curve = frames.lines[0].get_xydata()
-        assert np.allclose(curve[-1], (200, 0.9)) and np.allclose(seconds.lines[2].get_xydata()[-1], (8, 0.2))
+        assert np.allclose(returns.lines[0].get_xydata()[-1], (2, 0.45)) and len(returns.lines) == 2
+        assert np.allclose(frames.lines[0].get_xydata()[-1], (200, 0.9))
+        assert np.allclose(seconds.lines[2].get_xydata()[-1], (8, 0.2))
         assert np.allclose(seconds.lines[3].get_xydata()[-1], (8, 0.4))
         assert (results / "peers.png").stat().st_size > 0
+
+    def test_tables_are_written_between_their_marks(self, results, figures, monkeypatch):
+        page = results / "page.md"
+        parts = [f"<!-- {mark} -->\n<!-- end of {mark} -->" for mark in ("at equal time", "at equal frames")]
+        page.write_text("before\n" + "\n".join(parts) + "\nafter\n")
+        words = ["--results", str(results), "--page", str(page), "--figure", str(results / "peers.png")]
+        monkeypatch.setattr("sys.argv", ["table.py", *words])
+        table.main()
+        text = page.read_text()
+        assert text.startswith("before\n") and text.endswith("after\n") and text.count(f"`{TASK}`") == 4
+        assert "| 2 s |" in text.partition("at equal frames")[0] and "| 100 frames |" in text
