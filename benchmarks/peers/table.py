@@ -95,8 +95,10 @@ def _row(cells: Sequence[str]) -> str:
 
 def _cell(values: NDArray[np.float64], form: str) -> str:
     """The mean of ``[1, R]`` with its interval."""
+    if np.isnan(values).any():
+        return "-"
     low, high = mean_interval(values)
-    mean = "-" if np.isnan(values).any() else format(values.mean(), form)
+    mean = format(values.mean(), form)
     return mean if np.isnan(low[0]) else f"{mean} ({low[0]:{form}} to {high[0]:{form}})"
 
 
@@ -122,7 +124,7 @@ def _curve(panel: Axes, runs: Sequence[Run], axis: str, name: str, label: str) -
     (line,) = panel.plot(places, values.mean(-1), label=label)
     panel.fill_between(places, *mean_interval(values), color=line.get_color(), alpha=0.2)
     if name == "success_rate":
-        sampled = values_at(runs, axis, "sampled_success_rate", places)
+        sampled = values_at(runs, axis, "sampled_success_rate", places)  # NaN, which draws nothing, if there is none
         panel.plot(places, sampled.mean(-1), "--", color=line.get_color(), linewidth=1)
 
 
