@@ -27,7 +27,7 @@ from xuance.torch.agents.qlearning_family import drqn_agent
 
 from hdrqn_torchrl import keys
 
-NUM_ENVS, CHUNK = 10, 10_000
+NUM_ENVS, CHUNK, CAPACITY = 10, 10_000, 200_000
 SETTINGS: dict[str, Any] = {
     "policy": "DRQN_Policy",
     "representation": "Basic_MLP",
@@ -39,7 +39,6 @@ SETTINGS: dict[str, Any] = {
     "dropout": 0,
     "activation": "relu",
     "parallels": NUM_ENVS,
-    "buffer_size": 100_000,
     "batch_size": 8,
     "learning_rate": 0.001,
     "gamma": 0.99,
@@ -58,7 +57,7 @@ SETTINGS: dict[str, Any] = {
     "rewnorm_range": 5,
 }
 """Those of XuanCe's own file for CartPole, but exploration that lasts, and begins to learn, as long as ours. The memory
-is as large as ours; an update of 8 sequences follows each step of all worlds."""
+and the replay memory are as large as ours; an update of 8 sequences follows each step of all worlds."""
 _PLACE: dict[str, Any] = {
     "agent": "DRQN",
     "env_name": "hdrqn_torchrl",
@@ -149,7 +148,10 @@ class XuanceTraining(Training):
         env = self.make(NUM_ENVS, seed=arguments.seed)
         self.worlds = XuanceWorlds(Worlds(env, bonus=arguments.bonus), env.task.max_steps)
         place = {"env_id": arguments.id, "log_dir": folder, "model_dir": folder}
-        config = Namespace(**{**SETTINGS, **_PLACE, **place}, seed=arguments.seed, running_steps=arguments.frames)
+        longest = self.worlds.max_episode_steps
+        asked = {"seed": arguments.seed, "running_steps": arguments.frames}
+        asked["buffer_size"] = CAPACITY // longest * NUM_ENVS  # that many episodes, as it counts them
+        config = Namespace(**SETTINGS, **_PLACE, **place, **asked)
         self.learner = QuietAgent(config, self.worlds)
         self.resume()
 

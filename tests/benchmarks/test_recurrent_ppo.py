@@ -151,13 +151,13 @@ class TestRun:
         learn = run.model.learn
 
         def slowly(*args, **kwargs):
-            run._started -= 600.0
+            run._cpu_started -= 600.0
             learn(*args, **kwargs)
 
         monkeypatch.setattr(run.model, "learn", slowly)
         run.train()
         assert [(each.frames, each.episodes) for each in read(run.results)] == [(0, 2), (16, 2), (32, 4)]
-        assert read(run.results)[-1].seconds > 1200.0
+        assert read(run.results)[-1].cpu_seconds > 1200.0
 
     def test_the_second_evaluation_draws_actions_and_takes_no_time(self, tmp_path, monkeypatch):
         run = RecurrentPPOTraining(asked(tmp_path))
@@ -165,14 +165,14 @@ class TestRun:
 
         def slowly(*, final, greedy):
             asked_for.append(greedy)
-            run._started -= 0.0 if greedy else 500.0
+            run._cpu_started -= 0.0 if greedy else 500.0
             return {**evaluate(final=final, greedy=greedy), "success_rate": 0.25 if greedy else 0.75}
 
         monkeypatch.setattr(run, "evaluate", slowly)
         run.record()
         (told,) = read(run.results)
         assert asked_for == [True, False] and (told.success_rate, told.sampled_success_rate) == (0.25, 0.75)
-        assert told.seconds < 500.0 and run.seconds < 500.0
+        assert told.cpu_seconds < 500.0 and run.cpu_seconds < 500.0
 
     def test_drawn_actions_differ_from_the_likeliest(self, tmp_path):
         run = RecurrentPPOTraining(asked(tmp_path))
