@@ -96,7 +96,7 @@ def fill(trainer: Trainer, batches) -> None:  # noqa: ANN001
         for learner in learners:
             learner.store(batch)
     for learner in learners:
-        learner.updates = learner.updates_due()
+        learner.schedule.updates = learner.updates_due()
 
 
 def report(trainer: Trainer, folder: Path, speed: float) -> None:

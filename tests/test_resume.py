@@ -364,7 +364,7 @@ def test_a_checkpoint_without_memories_resumes_with_empty_ones(training, tmp_pat
     made = {name: learner.updates for name, learner in trainer.algorithm.learners.items()}
     for learner in trainer.algorithm.learners.values():
         assert not len(learner.buffer) and not learner.updates_due()
-        assert learner._frames_owed == pytest.approx(-64, abs=8)  # warmup_frames
+        assert learner.schedule.frames_owed == pytest.approx(-64, abs=8)  # warmup_frames
     trainer.train()
     for name, learner in trainer.algorithm.learners.items():
         assert 0 < learner.updates - made[name] <= (160 - 64) / 8 + 1

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -27,8 +26,9 @@ from hdrqn_torchrl.learning.memory import (
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision
 from hdrqn_torchrl.learning.settings import LearnerSettings
-from hdrqn_torchrl.learning.stored import check_counters, holds_inputs_twice
+from hdrqn_torchrl.learning.stored import holds_inputs_twice
 from hdrqn_torchrl.learning.target_network import SoftTargetUpdate
+from hdrqn_torchrl.learning.update_schedule import UpdateSchedule
 from hdrqn_torchrl.learning.update_step import UpdateStep
 
 
@@ -81,7 +81,7 @@ class Learner:
         self.device = next(iter(self._parameters.values())).device
         self.precision = choose_precision(settings.precision, network)
         self.guard = FiniteGuard(at_once=self.device.type == "cpu")
-        self.updates, self.frames = 0, 0
+        self.schedule = UpdateSchedule(settings.warmup_frames, settings.frames_per_update)
         captures = wants_capture(settings.capture, self.device.type)
         self.optimizer = GroupedAdam(
             self._parameters, separate=separate or {}, learning_rate=self.learning_rate, capturable=captures
@@ -116,8 +116,17 @@ class Learner:
         self._drawn: list[TensorDictBase] = []
         self.held = False
         """Whether it only stores; updates missed meanwhile are not made up for."""
-        self._warm_at = settings.warmup_frames  # or when a sequence could be drawn, if that was later
         self._has_warned = self._could_draw = False
+
+    @property
+    def frames(self) -> int:
+        """Environment steps seen so far."""
+        return self.schedule.frames
+
+    @property
+    def updates(self) -> int:
+        """Updates made so far."""
+        return self.schedule.updates
 
     @property
     def learning_rate(self) -> float:
@@ -136,7 +145,7 @@ class Learner:
         if batch.device != self.device:  # a collector without a device of its own numbers its episodes on the host
             batch = to_device(batch, self.device)
         self._continuity.check(batch)
-        self.frames += batch.numel()
+        self.schedule.frames += batch.numel()
         self._drawn = []
         self.optimizer.set_learning_rate(self.learning_rate)
         try:
@@ -149,13 +158,8 @@ class Learner:
         if transitions is not None:
             self.buffer.extend(transitions)
             self._longer = warn_of_longer(self._longer, transitions, self.settings)
-        if self._frames_owed > 0 and (self.held or not self._can_draw()):
-            self._warm_at += math.ceil(self._frames_owed)
-
-    @property
-    def _frames_owed(self) -> float:
-        """Frames since the warm-up for which no updates were made."""
-        return self.frames - self._warm_at - self.updates * self.settings.frames_per_update
+        if self.schedule.frames_owed > 0 and (self.held or not self._can_draw()):
+            self.schedule.let_go()
 
     def _can_draw(self) -> bool:
         """Whether the memory holds a sequence; warns once where it is full of others."""
@@ -169,8 +173,8 @@ class Learner:
 
     def updates_due(self) -> int:
         """How many updates are owed for the frames seen so far; none while no sequence can be drawn."""
-        owed = int((self.frames - self._warm_at) / self.settings.frames_per_update) - self.updates
-        return owed if owed > 0 and self._can_draw() else 0
+        due = self.schedule.due
+        return due if due and self._can_draw() else 0
 
     def learn(self) -> dict[str, Tensor]:
         """Draws one minibatch and learns from it: :meth:`update` of :meth:`sample`, or both captured together."""
@@ -205,7 +209,7 @@ class Learner:
         else:
             report = self._captured(sample, self._step.draw_ahead(self._sequence_len))
         priority = report.pop("priority", None)
-        self.updates += 1
+        self.schedule.updates += 1
         if self.settings.priority_exponent is not None and sample is not None:
             self.buffer.update_priority(sample["index"][:, 0], priority)
         return report
@@ -253,16 +257,14 @@ class Learner:
             "loss": self.loss.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "extract": self.extract.state_dict(),
-            "updates": self.updates,
-            "frames": self.frames,
-            "warm_at": self._warm_at,
             "precision": self.precision,
+            **self.schedule.state_dict(),
         }
         return rest | self.memory_state_dict() if memory else rest
 
     def memory_state_dict(self) -> dict[str, Any]:
         """The replay memory, the minibatches drawn from it and when it is warm: large, and optional."""
-        return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self._warm_at}
+        return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self.schedule.warm_at}
 
     def load_memory_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`memory_state_dict` returned.
@@ -277,7 +279,7 @@ class Learner:
             self.begin_empty()
             return
         self.buffer.load_state_dict(state["buffer"])
-        self._drawn, self._warm_at, self._could_draw = list(state["drawn"]), state["warm_at"], False
+        self._drawn, self.schedule.warm_at, self._could_draw = list(state["drawn"]), state["warm_at"], False
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up again.
@@ -285,12 +287,12 @@ class Learner:
         Raises:
             ValueError: if it is not the state of a learner with these settings.
         """
-        check_counters(state, self.settings)
+        self.schedule.check(state, most_owed=max(self.settings.capacity, 1_000_000))
         self._continuity.reset()
         self.optimizer.load_state_dict(state["optimizer"])
         self.loss.load_state_dict(state["loss"])
         self.extract.load_state_dict(state["extract"])
-        self.updates, self.frames = state["updates"], state["frames"]
+        self.schedule.load_state_dict(state)
         if "buffer" in state:
             self.load_memory_state_dict(state)
         else:
@@ -309,6 +311,5 @@ class Learner:
             self._captured.reset()
         if len(self.buffer):
             self.buffer.empty()
-        done = math.ceil(self.updates * self.settings.frames_per_update)
-        self._could_draw = False
-        self._drawn, self._warm_at = [], max(0, self.frames + self.settings.warmup_frames - done)
+        self.schedule.warm_up_again()
+        self._drawn, self._could_draw = [], False

@@ -30,7 +30,7 @@ def test_memories_forget_the_steps_whose_events_are_unknown():
         stored.append(len(learner.buffer))
     assert stored == [FRAMES, 0, FRAMES, 2 * FRAMES]
     assert agent.monitors["discovery"].selection.steps == 2 * FRAMES
-    assert learner._frames_owed == 4 * FRAMES - 2 * FRAMES - 40
+    assert learner.schedule.frames_owed == 4 * FRAMES - 2 * FRAMES - 40
 
 
 def test_subgoals_are_looked_for_every_discovery_frames_until_until_frames():

@@ -50,7 +50,7 @@ def learn(learner: Learner, updates: int) -> list[dict[str, float]]:
     """Updates at a falling learning rate."""
     reports = []
     for _ in range(updates):
-        learner.frames += 20
+        learner.schedule.frames += 20
         learner.optimizer.set_learning_rate(learner.learning_rate)
         reports.append({name: value.item() for name, value in learner.learn().items()})
     return reports

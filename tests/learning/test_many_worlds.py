@@ -23,8 +23,8 @@ def sequences_a_frame(name, worlds, scale):
     while learner.frames < FRAMES:
         due = learner.updates_due()
         shown += due * len(learner.sample()) if learner.updates == 0 else due * learner.settings.batch_size
-        learner.updates += due
-        learner.frames += batch.numel()
+        learner.schedule.updates += due
+        learner.schedule.frames += batch.numel()
     return shown / learner.frames
 
 
