@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import nn
 
-from hdrqn_torchrl.devices import multiplies_bfloat16
+from hdrqn_torchrl.devices import is_faster_in_bfloat16, multiplies_bfloat16
 
 Precision = Literal["fp32", "bf16"]
 
@@ -22,9 +22,9 @@ def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) ->
     """What a setting means for a network on its device.
 
     Args:
-        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it in hardware (a GPU that has it, a CPU with AMX
-            or AVX-512 BF16) and the network is large enough to gain, else ``"fp32"``. The same machine and network give
-            the same answer.
+        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it faster (a GPU that has it, a CPU with AMX, one of
+            AMD with AVX-512 BF16) and the network is large enough to gain, else ``"fp32"``. The same machine and
+            network give the same answer.
         network: its parameters are where it will be trained.
 
     Raises:
@@ -38,13 +38,11 @@ def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) ->
         raise ValueError(f"precision must be 'auto', 'fp32' or 'bf16', got {wanted!r}; 'fp32' is always right.")
     kind = next(network.parameters()).device.type
     if wanted == "auto":
-        return "bf16" if gains(network) and multiplies_bfloat16(kind) else "fp32"
-    if wanted == "bf16" and not multiplies_bfloat16(kind):
-        if kind != "cpu":
-            raise ValueError(f"precision must be 'fp32' or 'auto' on this device ({kind}), which lacks bf16.")
-        warnings.warn(
-            "precision='bf16' is slow on a CPU without AMX and AVX-512 BF16; use 'auto' or 'fp32'.", stacklevel=2
-        )
+        return "bf16" if gains(network) and is_faster_in_bfloat16(kind) else "fp32"
+    if wanted == "bf16" and kind != "cpu" and not multiplies_bfloat16(kind):
+        raise ValueError(f"precision must be 'fp32' or 'auto' on this device ({kind}), which lacks bf16.")
+    if wanted == "bf16" and kind == "cpu" and not is_faster_in_bfloat16(kind):
+        warnings.warn("precision='bf16' is slower than float32 on this CPU; use 'auto' or 'fp32'.", stacklevel=2)
     return wanted
 
 

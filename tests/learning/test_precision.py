@@ -6,7 +6,7 @@ from helpers import ALGORITHMS, build, collect, small_env, tiny_settings
 from torch import nn
 
 from hdrqn_torchrl.algorithms import make_v3
-from hdrqn_torchrl.devices import multiplies_bfloat16
+from hdrqn_torchrl.devices import is_faster_in_bfloat16, multiplies_bfloat16
 from hdrqn_torchrl.learning import precision as precision_module
 from hdrqn_torchrl.learning.precision import choose_precision, gains, matrix_products
 from hdrqn_torchrl.modules import compact_network, paper_network
@@ -15,10 +15,11 @@ from hdrqn_torchrl.modules.q_network import ExactLinear
 
 @pytest.fixture
 def hardware(monkeypatch):
-    """Sets the kinds of devices that multiply bfloat16."""
+    """Sets the kinds of devices that multiply bfloat16, and do so fast."""
 
     def hardware(*kinds):
-        monkeypatch.setattr(precision_module, "multiplies_bfloat16", lambda kind: kind in kinds)
+        for name in ("multiplies_bfloat16", "is_faster_in_bfloat16"):
+            monkeypatch.setattr(precision_module, name, lambda kind: kind in kinds)
 
     return hardware
 
@@ -27,11 +28,19 @@ LARGE, SMALL = nn.LSTM(4, 128), nn.LSTM(4, 127)
 
 
 @pytest.mark.parametrize(
-    ("unit", "has"), [("amx_bf16", True), ("avx512_bf16", True), ("avx512_f", False)], ids=["amx", "avx512", "neither"]
+    ("unit", "maker", "has", "is_faster"),
+    [
+        ("amx_bf16", "Intel Xeon", True, True),
+        ("avx512_bf16", "AMD EPYC", True, True),
+        ("avx512_bf16", "Intel Xeon", True, False),
+        ("avx512_f", "AMD EPYC", False, False),
+    ],
 )
-def test_cpus_multiply_bfloat16_with_either_unit(unit, has, monkeypatch):
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {unit: True})
-    assert multiplies_bfloat16("cpu") == has
+def test_cpus_multiply_bfloat16_with_either_unit_but_intel_s_are_slow_without_amx(
+    unit, maker, has, is_faster, monkeypatch
+):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {unit: True, "cpu_name": maker})
+    assert (multiplies_bfloat16("cpu"), is_faster_in_bfloat16("cpu")) == (has, is_faster)
 
 
 class TestChoice:
@@ -55,9 +64,11 @@ class TestChoice:
             warnings.simplefilter("error")
             assert choose_precision(wanted, SMALL) == wanted
 
-    def test_bf16_on_a_cpu_that_lacks_it_warns(self, hardware):
+    def test_bf16_on_a_cpu_that_is_slow_at_it_warns(self, hardware):
         hardware()
-        with pytest.warns(UserWarning, match="precision='bf16' is slow on a CPU without AMX and AVX-512 BF16; "):
+        with pytest.warns(
+            UserWarning, match="precision='bf16' is slower than float32 on this CPU; use 'auto' or 'fp32'"
+        ):
             assert choose_precision("bf16", LARGE) == "bf16"
 
     def test_bf16_on_a_gpu_that_lacks_it_is_refused(self, hardware):
