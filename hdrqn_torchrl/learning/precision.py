@@ -22,8 +22,8 @@ def choose_precision(wanted: Precision | Literal["auto"], network: nn.Module) ->
     """What a setting means for a network on its device.
 
     Args:
-        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it faster (a GPU that has it, a CPU with AMX, one of
-            AMD with AVX-512 BF16) and the network is large enough to gain, else ``"fp32"``. The same machine and
+        wanted: ``"auto"`` is ``"bf16"`` where the device multiplies it faster (a GPU that has it, a CPU with AMX, one
+            of AMD with AVX-512 BF16) and the network is large enough to gain, else ``"fp32"``. The same machine and
             network give the same answer.
         network: its parameters are where it will be trained.
 
