@@ -107,12 +107,13 @@ class ConvFeatures(Features):
         self.out_features = out_features
 
     def forward(self, image: Tensor) -> Tensor:
-        images = image.reshape(-1, *image.shape[-3:]).to(memory_format=torch.channels_last)
+        images = image.reshape(-1, *image.shape[-3:])
         first, others = self.convolutions[0], self.convolutions[1:]
         assert isinstance(first, nn.Conv2d)
         weight = first.weight
         if images.dtype == torch.uint8:  # exact even in bfloat16; scaling the weights costs less
             images, weight = images.to(autocast_dtype(images) or weight.dtype), weight / 255
+        images = images.contiguous(memory_format=torch.channels_last)  # of bytes that takes twice the time
         features = self.dense(others(functional.conv2d(images, weight, first.bias, first.stride)))
         return features.view(*image.shape[:-3], self.out_features)
 

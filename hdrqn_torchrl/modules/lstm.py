@@ -196,7 +196,7 @@ class Gaps:
 
     def insert(self, steps: Tensor) -> Tensor:
         """``[B, T, *]`` -> ``[L * B, *]``, time first. The gaps hold a copy of an arbitrary step."""
-        return steps.flatten(0, 1)[self._step]
+        return steps.flatten(0, 1).index_select(0, self._step)  # of images a tenth of the time of indexing
 
     def remove(self, steps: Tensor) -> Tensor:
         """``[L * B, *]`` -> ``[B, T, *]``."""

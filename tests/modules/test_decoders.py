@@ -3,6 +3,7 @@ import torch
 from torch import nn
 
 from hdrqn_torchrl.modules import CellDecoder, CodeDecoder, ImageDecoder, VectorDecoder
+from hdrqn_torchrl.modules.decoders import averaged
 
 
 def test_the_cell_decoder_error_is_the_mean_cross_entropy():
@@ -56,6 +57,15 @@ def test_the_image_decoder_predicts_small_images_as_they_are():
         decoder.pixels.weight.zero_()
         decoder.pixels.bias.copy_(image[0].flatten())
     assert decoder.error(torch.randn(4, 6), image)[0].item() == pytest.approx(0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize("size", [(14, 14), (14, 44), (3, 1), (44, 37)], ids=str)
+@pytest.mark.parametrize("lowered", [False, True])
+def test_images_are_averaged_as_by_adaptive_pooling_in_any_precision_of_learning(size, lowered):
+    images = torch.randint(0, 256, (5, 3, 44, 37)).float()
+    with torch.autocast("cpu", torch.bfloat16, enabled=lowered):
+        found = averaged(images, size)
+    torch.testing.assert_close(found, nn.functional.adaptive_avg_pool2d(images, size), rtol=1e-6, atol=1e-4)
 
 
 def test_the_vector_decoder_error_is_squared_on_a_logarithmic_scale():
