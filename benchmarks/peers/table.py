@@ -34,6 +34,7 @@ FIGURES = {
 PANELS = (("return_mean", "cpu_seconds"), ("success_rate", "cpu_seconds"), ("success_rate", "frames"))
 AGENTS = {
     "v3_2_levels": "hDRQNv3",
+    "v3_3_levels": "hDRQNv3, three levels",
     "v3_flat": "v3 without hierarchy",
     "recurrent_ppo": "RecurrentPPO (sb3-contrib)",
     "xuance_drqn": "DRQN (XuanCe)",
@@ -53,7 +54,8 @@ def read_all(folder: Path) -> dict[str, Groups]:
 def label_of(evaluation: Evaluation) -> str:
     """What the agent is called, and whether it was told of subgoals by a bonus."""
     name = AGENTS[evaluation.agent]
-    return name if evaluation.agent == "v3_2_levels" else f"{name}, {'bonus' if evaluation.bonus else 'no bonus'}"
+    is_hierarchical = evaluation.agent.endswith("_levels")  # and takes no bonus
+    return name if is_hierarchical else f"{name}, {'bonus' if evaluation.bonus else 'no bonus'}"
 
 
 def values_at(runs: Sequence[Run], axis: str, figure: str, places: NDArray[np.float64]) -> NDArray[np.float64]:

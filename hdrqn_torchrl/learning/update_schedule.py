@@ -78,8 +78,9 @@ class UpdateSchedule:
                     f"the stored learner's {name} must be a whole number in [0, 2**53), got {value!r}; it is damaged: "
                     "use another checkpoint."
                 )
-        owed = state["frames"] - state["warm_at"] - state["updates"] * self.frames_per_update
-        if owed > most_owed:
+        stored = UpdateSchedule(self.warmup_frames, self.frames_per_update)
+        stored.load_state_dict(state)
+        if stored.frames_owed > most_owed:
             raise ValueError(
                 f"the stored learner's updates must make up for its frames, got {state['updates']} for "
                 f"{state['frames']}; load it with the frames_per_update that it was saved with, or use another one."

@@ -180,6 +180,10 @@ class TestTable:
         ]
         assert [row[3] for row in cells] == returns
 
+    def test_hierarchical_agents_have_no_bonus_to_tell_of(self):
+        labels = [table.label_of(evaluation(0, 0.0, agent=agent, bonus=0.0)) for agent in table.AGENTS]
+        assert labels[:3] == ["hDRQNv3", "hDRQNv3, three levels", "v3 without hierarchy, no bonus"]
+
     def test_agents_without_probabilities_have_no_success_with_drawn_actions(self, results):
         rows = table.rows_of(TASK, table.read_all(results)[TASK], "frames")
         assert [row.split("|")[8].strip() for row in rows] == ["-", "0.40"]
