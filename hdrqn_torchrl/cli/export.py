@@ -14,7 +14,7 @@ allowed_targets builders of your own that the run may name: [package.builder]
 
 The decision takes and returns tensors by name, for any number of worlds: what the environment shows (observation,
 is_init; attained, available and others, as far as the agent reads them) and the state that the last decision returned.
-docs/export.md explains each, and has a player of 20 lines.
+docs/export.md explains each; examples/onnx_player.py plays such a file.
 """
 
 from __future__ import annotations
