@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
@@ -93,5 +91,35 @@ def make_drqn(
     )
 
 
-make_dqn = partial(make_drqn, recurrent=False, learner=presets.DQN_LEARNER)
-"""Flat Q-learning without memory (Mnih et al., 2015); see :func:`make_drqn`."""
+def make_dqn(
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    total_frames: int | None = None,
+    learner: LearnerSettings = presets.DQN_LEARNER,
+    exploration: EpsilonGreedy | None = None,
+    gamma: float = 0.99,
+) -> Algorithm:
+    """Flat Q-learning without memory (Mnih et al., 2015) on the task's total reward.
+
+    Args:
+        env, architecture, total_frames, learner, exploration, gamma: as in :func:`make_drqn`.
+
+    Raises:
+        ValueError: if the environment lacks something.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> make_dqn(MultiGoalGridEnv(num_envs=4), compact_network()).policy.state_keys
+        []
+    """
+    return make_drqn(
+        env,
+        architecture,
+        total_frames=total_frames,
+        learner=learner,
+        exploration=exploration,
+        gamma=gamma,
+        recurrent=False,
+    )

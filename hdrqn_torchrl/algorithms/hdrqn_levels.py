@@ -72,8 +72,14 @@ class LevelBuilder:
             recurrent=self.recurrent,
             prediction_steps=self.prediction_steps,
         )
-        subgoal_key, init_key, mask_key = pursued.subgoal, pursued.option_init, self.has.action_mask_key
-        return SubController(network, exploration, subgoal_key=subgoal_key, init_key=init_key, mask_key=mask_key)
+        return SubController(
+            network,
+            exploration,
+            subgoal_key=pursued.subgoal,
+            init_key=pursued.option_init,
+            mask_key=self.has.action_mask_key,
+            option_keys=pursued,
+        )
 
     def upper_controller(self, index: int, exploration: EpsilonGreedy) -> MetaController:
         """The controller of a level that chooses subgoals, ``index`` >= 1."""
@@ -102,6 +108,7 @@ class LevelBuilder:
             hidden_key=hidden_key,
             cell_key=cell_key,
             exploration_key=names.exploration,
+            option_keys=above or keys.OptionKeys(),
         )
 
     def sub_learner(self, controller: SubController, settings: LearnerSettings) -> Learner:

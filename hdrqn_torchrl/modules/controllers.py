@@ -20,6 +20,7 @@ from torchrl.envs.transforms import TensorDictPrimer
 from torchrl.modules import recurrent_mode
 
 from hdrqn_torchrl import keys
+from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, carried_by, choose
 from hdrqn_torchrl.modules.exploration_checks import (
     check_chooses_subgoals,
@@ -44,6 +45,7 @@ class SubController(TensorDictModuleBase):
         hidden_key, cell_key: LSTM state ``[H]``.
         exploration_key: what the exploration carries, if anything.
         mask_key: actions that can be chosen ``[A]`` bool; ``None``: all of them.
+        option_keys: entries of the options that it pursues, whose outcome ``exploration`` may depend on.
 
     Raises:
         ValueError: if network or ``exploration`` do not fit a flat or hierarchical agent.
@@ -74,6 +76,7 @@ class SubController(TensorDictModuleBase):
         cell_key: NestedKey = keys.SUB_CELL,
         exploration_key: NestedKey = keys.ACTION_EXPLORATION,
         mask_key: NestedKey | None = None,
+        option_keys: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
     ) -> None:
         super().__init__()
         if (subgoal_key is None) != (network.num_conditions == 0):
@@ -85,7 +88,7 @@ class SubController(TensorDictModuleBase):
         if subgoal_key is None:
             check_condition(self.exploration, "exploration")
         else:
-            self.exploration.set_num_subgoals(network.num_conditions)
+            self.exploration.set_num_subgoals(network.num_conditions, names=option_keys)
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
         self.hidden_key, self.cell_key, self.exploration_key = hidden_key, cell_key, exploration_key
@@ -173,6 +176,7 @@ class MetaController(TensorDictModuleBase):
         action_value_key: Q-values, written in learning.
         hidden_key, cell_key: LSTM state ``[H]``.
         exploration_key: what the exploration carries from option to option, if anything.
+        option_keys: entries of the options of the level above, whose outcome ``exploration`` may depend on.
 
     Raises:
         ValueError: if ``network`` and ``condition_key`` do not fit, nothing is read, or ``exploration`` repeats its
@@ -206,6 +210,7 @@ class MetaController(TensorDictModuleBase):
         hidden_key: NestedKey = keys.META_HIDDEN,
         cell_key: NestedKey = keys.META_CELL,
         exploration_key: NestedKey = keys.SUBGOAL_EXPLORATION,
+        option_keys: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
     ) -> None:
         super().__init__()
         if not input_keys or isinstance(input_keys, str):
@@ -222,7 +227,7 @@ class MetaController(TensorDictModuleBase):
         if condition_key is None:
             check_condition(self.exploration, "exploration")
         else:
-            self.exploration.set_num_subgoals(network.num_conditions)
+            self.exploration.set_num_subgoals(network.num_conditions, names=option_keys)
         check_chooses_subgoals(self.exploration, "exploration")
         self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
         self.condition_key, self.init_key = condition_key, init_key

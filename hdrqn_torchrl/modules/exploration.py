@@ -96,7 +96,7 @@ class EpsilonGreedy(nn.Module):
         progress = (self.frames / self.anneal_frames).clamp(max=1.0)
         self.epsilon.copy_(self.start + (self.end - self.start) * progress)
 
-    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys = OptionKeys()) -> None:  # noqa: B008 (frozen)
+    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys) -> None:
         """Tells among how many subgoals the pursued one is; here they make no difference.
 
         Args:

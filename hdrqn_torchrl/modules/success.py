@@ -84,7 +84,7 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
 
     Examples:
         >>> exploration = SuccessEpsilonGreedy(1.0, 0.1)
-        >>> exploration.set_num_subgoals(2)
+        >>> exploration.set_num_subgoals(2, names=OptionKeys())
         >>> _ = exploration.success.rates.copy_(torch.tensor([0.25, 0.95]))
         >>> exploration.epsilons(torch.zeros(2), torch.tensor([0, 1])).tolist()
         [0.75, 0.10000000149011612]
@@ -110,7 +110,7 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
         check_size("window", window, 100)
         self.window = window
 
-    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys = OptionKeys()) -> None:  # noqa: B008 (frozen)
+    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys) -> None:
         """Must be called before it chooses; the policies that explore with it do."""
         self.success = SubgoalSuccess(num_subgoals, window=self.window, names=names)
 

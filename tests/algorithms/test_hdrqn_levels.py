@@ -6,7 +6,7 @@ from helpers import build, collect, house, tiny_settings
 from torchrl.modules import set_recurrent_mode
 
 from hdrqn_torchrl.algorithms import make_hdrqn
-from hdrqn_torchrl.modules import EpsilonGreedy, compact_network, writing_values
+from hdrqn_torchrl.modules import EpsilonGreedy, SuccessEpsilonGreedy, compact_network, writing_values
 
 LEVELS = ("sub", "rooms", "meta")
 
@@ -225,6 +225,19 @@ def test_hindsight_and_refreshed_states_work_at_the_lowest_levels():
     for learner in algorithm.learners.values():
         assert learner.learn()["loss"].isfinite()
     assert algorithm.learners["rooms"].refresh is not None and algorithm.learners["meta"].refresh is None
+
+
+@pytest.mark.parametrize("name", ["hdqn", "v1", "v2", "v3"])
+def test_success_is_that_of_the_options_which_a_level_pursues(name):
+    names = ("sub_exploration", "middle_exploration")
+    algorithm, env = three_levels(name, **{each: SuccessEpsilonGreedy() for each in names})
+    (batch,) = collect(algorithm, env, 60)
+    algorithm.observe(batch)
+    for level, prefix in (("sub", "rooms_"), ("rooms", "")):
+        done = batch["next", f"{prefix}option_done"].squeeze(-1)
+        success = algorithm.explorations[level].success
+        ended = batch["next", f"{prefix}active_subgoal"][done].bincount(minlength=len(success.options))
+        assert done.any() and success.options.tolist() == ended.tolist()
 
 
 class TestSettings:

@@ -28,6 +28,12 @@ BUILDERS = {
 }
 LEARNERS = {"sub", "meta", "learner"}
 PYTHON_ONLY = {"repeatable_subgoals", "total_frames"}  # what the environment is like; what conf/ puts into learners
+OF_MEMORY = {"recurrent", "prediction_steps", "prediction_weight"}
+TAKEN_AWAY = {
+    "dqn": OF_MEMORY,
+    "hdqn": {*OF_MEMORY, "version", "meta_input", "meta_input_time", "refresh_hidden_steps"},
+}
+"""Settings in ``conf/`` of the general builder that an agent without memory has no use for."""
 DIFFERS = {"precision": ("auto", "fp32")}  # a training asks the machine; a call in Python computes the same on all
 NOT_V3 = {"max_target", "trace_decay", "n_step"}  # v3's loss has targets of its own
 
@@ -57,6 +63,7 @@ def test_arguments(name):
     arguments = inspect.signature(BUILDERS[name]).parameters
     defaults = {key: each.default for key, each in arguments.items() if each.default is not inspect.Parameter.empty}
     stated = {key: value for key, value in composed(name).items() if key != "_target_"}
+    stated = {key: value for key, value in stated.items() if key not in TAKEN_AWAY.get(name, set())}
     assert set(defaults) - PYTHON_ONLY == set(stated)
     built = LEARNERS | {key for key in stated if key.endswith("exploration")}  # compared below
     assert {key: as_numbers(defaults[key]) for key in stated if key not in built} == {

@@ -4,10 +4,12 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.utils import _locate
 from omegaconf import OmegaConf
 from run_folders import CONF
 
 from hdrqn_torchrl.cli.configuration import resolved
+from hdrqn_torchrl.runs.arguments import _taken_by
 from hdrqn_torchrl.runs.building import build_algorithm
 from hdrqn_torchrl.runs.settings import check
 
@@ -41,6 +43,39 @@ def test_all_learners_have_one_precision(name):
 def test_the_penalty_for_a_wrong_subgoal_follows_the_task(chosen, penalty):
     with initialize_config_dir(CONF, version_base="1.3"):
         assert compose("config", overrides=chosen).algo.wrong_subgoal_reward == penalty
+
+
+GIVEN_BY_TRAIN = {"env", "architecture", "total_frames", "seed", "device", "repeatable_subgoals"}
+LEFT_OUT = {
+    "hdrqn_torchrl.envs.make_montezuma": {"keep_pixels"},  # for those who watch
+    "hdrqn_torchrl.learning.LearnerSettings": {"max_target", "trace_decay", "n_step"},  # v3 has its own, or none
+}
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        *([f"algo={name}"] for name in ("dqn", "drqn", "hdqn", "v1", "v2", "v3")),
+        *([f"env={name}"] for name in ("four_rooms", "nine_rooms", "minigrid", "gym")),
+        *(["env=montezuma", f"algo={name}"] for name in ("v2", "v3")),
+        ["network=paper"],
+    ],
+    ids=str,
+)
+def test_every_argument_of_a_builder_stands_in_its_file(chosen):
+    def check(node):
+        if "_target_" in node:
+            target = node["_target_"]
+            missing = set(_taken_by(_locate(target))) - set(node) - GIVEN_BY_TRAIN
+            assert missing <= LEFT_OUT.get(target, set()), target
+        for value in node.values():
+            if isinstance(value, dict):
+                check(value)
+
+    with initialize_config_dir(CONF, version_base="1.3"):
+        config = OmegaConf.to_container(compose("config", overrides=chosen))
+    for group in ("env", "algo", "network"):
+        check(config[group])
 
 
 VARIANTS = sorted(path.stem for path in (Path(CONF) / "variant").glob("*.yaml"))

@@ -16,7 +16,7 @@ from hdrqn_torchrl.cli.command_line import command_line
 
 ROOM = "env.layout=['#####','#   #','#   #','#   #','#####']"
 FINDING = [
-    *TINY, ROOM, "env.view=3", "+env.num_obstacles=0", "algo=v3", "algo.subgoals=discovered", "logger=csv",
+    *TINY, ROOM, "env.view=3", "env.num_obstacles=0", "algo=v3", "algo.subgoals=discovered", "logger=csv",
     "algo.discovery.max_subgoals=3", "algo.discovery.warmup_frames=800", "algo.discovery.discovery_frames=200",
     "algo.learner.batch_size=4", "algo.learner.warmup_frames=200", "algo.learner.frames_per_update=100",
     "algo.memory_size=8", "algo.head_size=8", "evaluation.ceilings=false",

@@ -63,14 +63,14 @@ class TestSuccessEpsilonGreedy:
 
     def test_epsilon_of_each_subgoal(self):
         exploration = SuccessEpsilonGreedy(1.0, 0.1)
-        exploration.set_num_subgoals(3)
+        exploration.set_num_subgoals(3, names=OptionKeys())
         exploration.success.rates.copy_(torch.tensor([0.0, 0.6, 1.0]))
         for subgoal, epsilon in enumerate((1.0, 0.4, 0.1)):
             assert self.explored(exploration, subgoal) == pytest.approx(epsilon, abs=0.05)
 
     def test_with_a_fixed_epsilon_neither_success_nor_environment_make_a_difference(self):
         exploration = SuccessEpsilonGreedy(0.7, 0.05, ladder=7.0)
-        exploration.set_num_subgoals(2)
+        exploration.set_num_subgoals(2, names=OptionKeys())
         exploration.success.rates.copy_(torch.tensor([0.3, 1.0]))
         exploration.fixed = 0.25
         exploration.step(1000)
@@ -79,7 +79,7 @@ class TestSuccessEpsilonGreedy:
     def test_it_learns_from_batches_and_its_state_travels_with_the_weights(self):
         exploration, other = SuccessEpsilonGreedy(), SuccessEpsilonGreedy()
         for each in (exploration, other):
-            each.set_num_subgoals(1)
+            each.set_num_subgoals(1, names=OptionKeys())
         exploration.observe(batch(WON, WON, WON, LOST))
         other.load_state_dict(exploration.state_dict())
         assert other.epsilons(torch.zeros(1), torch.tensor([0])).item() == pytest.approx(0.25)
@@ -95,6 +95,6 @@ class TestSuccessEpsilonGreedy:
 
     def test_epsilon_falls_with_the_schedule_as_well(self):
         exploration = SuccessEpsilonGreedy(1.0, 0.1, anneal_frames=100)
-        exploration.set_num_subgoals(1)
+        exploration.set_num_subgoals(1, names=OptionKeys())
         exploration.step(1000)
         assert exploration.epsilons(torch.zeros(1), torch.tensor([0])).item() == pytest.approx(0.1)

@@ -10,7 +10,7 @@ from run_folders import CONF, configure
 
 from hdrqn_torchrl.cli.configuration import plain, resolved
 from hdrqn_torchrl.envs.gym.arguments import PACKAGES
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.arguments import SettingsError, check_arguments
 from hdrqn_torchrl.runs.settings import check
 from hdrqn_torchrl.runs.trust import ALLOWED_TARGETS, KNOWN_PACKAGES, check_targets
 
@@ -31,6 +31,14 @@ class TestCheckTargets:
     def test_every_allowed_name_is_a_builder_of_this_package(self, target):
         module, _, name = target.rpartition(".")
         assert module.startswith("hdrqn_torchrl.") and callable(getattr(importlib.import_module(module), name))
+
+    @pytest.mark.parametrize("target", ALLOWED_TARGETS)
+    def test_every_builder_refuses_settings_that_it_does_not_take(self, target):
+        module, _, name = target.rpartition(".")
+        with pytest.raises(SettingsError, match=f"^part.misspelt must be left out, got 1: {target} takes "):
+            check_arguments(
+                {"_target_": target, "misspelt": 1}, "part", lambda _: getattr(importlib.import_module(module), name)
+            )
 
     @pytest.mark.parametrize(
         ("key", "value", "path"),
