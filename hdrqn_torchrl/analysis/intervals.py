@@ -4,7 +4,7 @@ All are t intervals. A bootstrap over n seeds is too narrow: percentiles of resa
 normal values in 50, 74, 84 and 90 % of cases with 2, 3, 5 and 10 seeds at a nominal 95 %; BCa does no better. t
 intervals cover it in 95 % with any number; of skewed, bounded values like ours (returns near their ceiling) in 92 to
 94 %.
-(``tests/test_intervals.py``.)
+(``tests/analysis/test_intervals.py``.)
 """
 
 from __future__ import annotations

@@ -22,9 +22,17 @@ Metrics = dict[str, list[float]]
 References = dict[str, dict[str, float]]
 Array = NDArray[np.floating[Any]]
 
+AXES = {
+    "frames": "environment frames",
+    "episodes": "training episodes",
+    "updates": "updates of all levels",
+    "wall_seconds": "wall time",
+    "processor_seconds": "processor time",
+}
+"""Columns that all others can be seen against, and what they are."""
 LARGEST_WIDTH = 10_000  # columns; 100 subgoals have as many legs
 _SHARES = ("success", "in_order")
-_UNTIL = re.compile(r"(?P<axis>frames|episodes|updates|wall_seconds) until (?P<column>\S+) *>= *(?P<level>-?[\d.]+)")
+_UNTIL = re.compile(rf"(?P<axis>{'|'.join(AXES)}) until (?P<column>\S+) *>= *(?P<level>-?[\d.]+)")
 
 
 @dataclass(frozen=True)
@@ -208,7 +216,7 @@ def final_value(run: Run, column: str) -> float:
     Args:
         run: the run.
         column: ``greedy/...``: from the summary, else the last that was logged. ``"frames until behaviour/return>=1"``:
-            frames (or episodes, updates, wall_seconds) at the first log point at which a column was as high.
+            frames (or another of :data:`AXES`) at the first log point at which a column was as high.
 
     Returns:
         NaN if there is none.

@@ -1,1 +1,1 @@
-"""The programs: ``train``, ``evaluate``, ``watch``, ``plot``, ``report``. The only part that knows Hydra."""
+"""The programs: one module each, and what they share. The only part that knows Hydra."""

@@ -11,7 +11,7 @@ kind      curves: the paper's four curves with greedy evaluations as points (def
 columns   any columns of metrics.csv instead, one panel each: columns=greedy/return,greedy/success,sub/loss; with
           kind=bars also how long it took: columns='wall_seconds until behaviour/return>=1.01', a mean only of groups
           whose runs all got there
-x         frames (default), episodes, updates or wall_seconds
+x         frames (default), episodes, updates, wall_seconds or processor_seconds
 by        what makes a group: algo (default), env, network, any setting (algo.sub.slice_len), several (algo,network),
           run (each run alone), or null (all together)
 center    mean (default) or iqm, the interquartile mean; either with a 95 % t interval over seeds (of the IQM after
@@ -43,6 +43,7 @@ from hdrqn_torchrl.analysis.comparison import DISCOVERY, FINALS, GREEDY, PAPER, 
 from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves, estimate_finals, write_table
 from hdrqn_torchrl.analysis.grouping import Entry, Row, differences, rows_of, task_key, value_of
 from hdrqn_torchrl.analysis.results import (
+    AXES,
     Run,
     asks_for_a_time,
     final_value,
@@ -55,7 +56,7 @@ from hdrqn_torchrl.runs.arguments import SettingsError
 
 ALLOWED = {
     "kind": ("curves", "greedy", "discovery", "bars"),
-    "x": ("frames", "episodes", "updates", "wall_seconds"),
+    "x": tuple(AXES),
     "center": ("mean", "iqm"),
     "ceilings": ("known", "simulate", "none"),
 }

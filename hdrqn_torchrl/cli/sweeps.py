@@ -20,7 +20,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn, TextIO
+from typing import Any, BinaryIO, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
@@ -120,8 +120,10 @@ def _write(ledger: Path, config: DictConfig, folder: str, state: str) -> None:
         "overrides": list(config.hydra.overrides.task),
         "state": state,
     }
-    with ledger.open("a") as file, _alone(file):
-        file.write(json.dumps(note) + "\n")  # in one piece, as other processes write here, too
+    with ledger.open("a+b") as file, _alone(file):
+        file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
+        torn = file.read() not in (b"", b"\n")  # by a full disk, or a process that was killed
+        file.write(b"\n" * torn + json.dumps(note).encode() + b"\n")  # in one piece: other processes write here, too
         file.flush()
 
 
@@ -146,7 +148,7 @@ def _fail(result: JobReturn, config: DictConfig, reason: str) -> JobReturn:
 
 
 @contextlib.contextmanager
-def _alone(file: TextIO) -> Iterator[None]:
+def _alone(file: BinaryIO) -> Iterator[None]:
     """Locks a file that processes of other machines write to as well, where the operating system can."""
     if fcntl is not None:
         with contextlib.suppress(OSError):  # not every file system can
@@ -177,9 +179,17 @@ def was_started(config: DictConfig, job: int) -> bool:
 
 def read_ledger(ledger: Path) -> list[Note]:
     """The last note about each job that was started, in the order of the jobs."""
-    lines = ledger.read_text().splitlines() if ledger.exists() else []
-    last = {note["job"]: note for note in map(json.loads, lines)}
+    lines = ledger.read_bytes().splitlines() if ledger.exists() else []
+    last = {note["job"]: note for line in lines if (note := _read(line))}
     return [last[job] for job in sorted(last)]
+
+
+def _read(line: bytes) -> Note | None:
+    """A note, or ``None`` of a line that was not written to its end."""
+    try:
+        return json.loads(line)
+    except ValueError:
+        return None
 
 
 def unfinished(notes: list[Note]) -> list[Note]:

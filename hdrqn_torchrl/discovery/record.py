@@ -28,6 +28,7 @@ class EventRecord:
         self._rows: list[Tensor] = []
         self._kept = 0  # rows in all of these
         self._ends: list[Tensor] = []
+        self._worlds = 1
         self._clock = 0
         self._since = 0
 
@@ -55,6 +56,7 @@ class EventRecord:
         self._kept += len(self._rows[-1])
         ends = after.get(keys.DONE).squeeze(-1)
         self._ends.append(torch.stack([worlds[ends], steps[ends]], -1).cpu())
+        self._worlds = max(self._worlds, action.shape[0])
         self._clock += action.shape[1]
         if self._kept > 2 * _ROWS:
             self._forget()
@@ -63,9 +65,8 @@ class EventRecord:
         """Steps by episode."""
         rows = torch.cat(self._rows) if self._rows else torch.zeros((0, 4 + self.num_tokens)).long()
         ends = torch.cat(self._ends) if self._ends else torch.zeros((0, 2)).long()
-        worlds = 1 + int(max(rows[:, 0].max() if len(rows) else 0, ends[:, 0].max() if len(ends) else 0))
         span = self._clock + 1
-        last = torch.arange(worlds) * span + self._clock - 1  # of episodes that have not ended
+        last = torch.arange(self._worlds) * span + self._clock - 1  # of episodes that have not ended
         ended = torch.cat([ends[:, 0] * span + ends[:, 1], last]).unique()  # sorted
         begin = torch.cat([torch.tensor([-1]), ended[:-1]]) + 1
         begin = torch.where(begin % span == self._clock, begin // span * span + span, begin)  # the next world
@@ -93,6 +94,7 @@ class EventRecord:
         return {
             "rows": torch.cat(self._rows) if self._rows else None,  # one tensor, where batches had thousands
             "ends": torch.cat(self._ends) if self._ends else None,
+            "worlds": self._worlds,
             "clock": self._clock,
             "since": self._since,
         }
@@ -101,4 +103,6 @@ class EventRecord:
         """Restores what :meth:`state_dict` returned."""
         self._rows, self._ends = ([] if state[name] is None else [state[name].cpu()] for name in ("rows", "ends"))
         self._kept = sum(map(len, self._rows))
+        seen = [int(each[:, 0].max()) + 1 for each in (*self._rows, *self._ends) if len(each)]
+        self._worlds = state.get("worlds", max(seen, default=1))  # earlier versions did not store it
         self._clock, self._since = state["clock"], state["since"]

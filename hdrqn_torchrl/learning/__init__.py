@@ -1,6 +1,7 @@
 """Learning: one learner for each level, its settings, and its monitors."""
 
 from hdrqn_torchrl.learning.learner import Learner
+from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.learning.memory import Extract
 from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
 from hdrqn_torchrl.learning.phases import PhaseOne, Phases, phase_monitors
@@ -11,6 +12,7 @@ __all__ = [
     "Extract",
     "Learner",
     "LearnerSettings",
+    "LegCounter",
     "Monitor",
     "PhaseOne",
     "Phases",

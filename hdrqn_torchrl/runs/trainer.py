@@ -226,7 +226,7 @@ class Trainer:
             }
             if (ceiling := self.ceiling()) is not None:
                 row["greedy/ceiling"] = ceiling
-            best = result["return_mean"] > self.best_return
+            best = self.frames > 0 and result["return_mean"] > self.best_return  # before training nothing is saved
         with self._saving.in_parts():
             if best:
                 self.best_return = result["return_mean"]

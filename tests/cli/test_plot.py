@@ -20,9 +20,8 @@ output_root: ${hydra:nowhere}
 seed: SEED
 total_frames: 300
 """  # noqa: E501
-COLUMNS = (
-    "frames,episodes,updates,wall_seconds,behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/ceiling"
-)
+CLOCKS = "frames,episodes,updates,wall_seconds,processor_seconds"
+COLUMNS = f"{CLOCKS},behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/ceiling"
 
 
 def make_run(folder, *, algo="v2", env="gridworld", seed=0, view=5, steps=50, length=8, offset=0.0, finished=True):
@@ -35,7 +34,7 @@ def make_run(folder, *, algo="v2", env="gridworld", seed=0, view=5, steps=50, le
     for index in range(5 if finished else 3):
         behaviour = f"{offset + index},{50 - index}" if index else ","
         greedy = f"{offset + index / 4},{index / 4},1.75" if index % 2 == 0 else ",,"
-        rows.append(f"{index * 100},{index * 7},{index * 10},{index * 60.5},{behaviour},{greedy}")
+        rows.append(f"{index * 100},{index * 7},{index * 10},{index * 60.5},{index * 30.5},{behaviour},{greedy}")
     (folder / "metrics.csv").write_text("\n".join(rows) + ("\n" if finished else "\n300,21,3"))
     if finished:
         summary = {"return_mean": offset + 1.5, "success_rate": 0.75, "steps_mean": 20.0, "frames": 400}
@@ -133,7 +132,8 @@ def test_time_to_a_threshold_is_averaged_only_if_all_runs_reach_it(run, outputs)
 
 
 @pytest.mark.parametrize(
-    ("x", "last"), [("frames", "400"), ("episodes", "28"), ("updates", "40"), ("wall_seconds", "242")]
+    ("x", "last"),
+    [("frames", "400"), ("episodes", "28"), ("updates", "40"), ("wall_seconds", "242"), ("processor_seconds", "122")],
 )
 def test_any_clock_can_be_the_x_axis(run, outputs, x, last):
     run("runs=outputs", "out=[table.csv,a.png]", f"x={x}", "ceilings=none")
@@ -265,7 +265,10 @@ def test_a_folder_with_nothing_but_metrics_is_drawn(run, tmp_path):
         (["runs=outputs", "out=[]"], "out must name at least one file"),
         (["runs=outputs", "out=outputs/metrics.csv"], "out must not have the name of a run's own data"),
         (["runs=outputs", "out=a.png", "kind=lines"], "kind must be one of curves, greedy, discovery, bars, got"),
-        (["runs=outputs", "out=a.png", "x=steps"], "x must be one of frames, episodes, updates, wall_seconds"),
+        (
+            ["runs=outputs", "out=a.png", "x=steps"],
+            "x must be one of frames, episodes, updates, wall_seconds, processor_seconds",
+        ),
         (["runs=outputs", "out=a.png", "center=median"], "center must be one of mean, iqm, got 'median'"),
         (["runs=outputs", "out=a.png", "ceilings=all"], "ceilings must be one of known, simulate, none"),
         (["runs=outputs", "out=a.png", "smooth=-1"], "smooth must be >= 0, got -1"),

@@ -267,6 +267,13 @@ class TestCallback:
             "job0 (seed=0)", "stopped or killed", "job2 (seed=2)", "stopped or killed",
         ]  # fmt: skip
 
+    def test_a_note_that_was_torn_off_spoils_no_other(self, callback, tmp_path):
+        callback.on_job_start(job_config(tmp_path, number=0))
+        with callback.ledger.open("a") as file:
+            file.write('{"job": 1, "st')
+        callback.on_job_start(job_config(tmp_path, number=2))
+        assert [note["job"] for note in sweeps.read_ledger(callback.ledger)] == [0, 2]
+
     def test_no_report_without_unfinished_jobs(self, tmp_path, capsys):
         sweeps.report(tmp_path / "jobs.jsonl")
         assert capsys.readouterr().err == ""

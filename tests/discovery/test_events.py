@@ -9,6 +9,7 @@ from tensordict import TensorDict
 from hdrqn_torchrl.discovery import ChangeDetector, EventSelection
 from hdrqn_torchrl.discovery.control import Control
 from hdrqn_torchrl.discovery.history import History, Occurrences, events_of
+from hdrqn_torchrl.discovery.record import EventRecord
 
 KEY, DOOR, GOAL, NOISE, SHADE = 1, 2, 3, 4, 17
 PLACES = 10  # of two codes: tokens 1 to 4 belong to place 0
@@ -110,6 +111,15 @@ def test_episodes_go_on_from_batch_to_batch():
     assert list(zip(history.episode.tolist(), history.step.tolist(), strict=True)) == [
         (0, 3), (1, 0), (1, 6), (1, 14), (2, 0), (2, 6)
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("world", [0, 3])
+def test_worlds_without_events_have_episodes_too(world):
+    record = EventRecord(5)
+    batch = episodes(*[[(5, KEY, DO, 0.0)] if index == world else [] for index in range(4)])
+    batch["next", "done"][:] = False
+    record.add(batch)
+    assert record.history().lengths.tolist() == [20] * 4
 
 
 def test_a_resumed_selection_goes_on_as_it_was():

@@ -1,3 +1,5 @@
+import itertools
+import math
 import signal
 import time
 import warnings
@@ -241,6 +243,7 @@ class TestWhenItSaves:
             at = dict.fromkeys(range(1, 20), tick) | (at or {})
             quiet = {"total_frames": 100, "log_frames": 1_000, "evaluation_frames": 1_000, "checkpoint_frames": 1_000}
             checkpoints = RecordingCheckpoints(tmp_path / "checkpoints")
+            results = itertools.chain(results, itertools.repeat(-math.inf))  # which is never the best
             trainer = make_trainer(
                 collector=FakeCollector(at), results=results, checkpoints=checkpoints, **(quiet | settings)
             )
@@ -290,9 +293,10 @@ class TestWhenItSaves:
         assert not list(tmp_path.iterdir())
 
 
-def test_the_best_and_the_last_weights_are_kept(tmp_path):
+@pytest.mark.parametrize("untrained", [0.1, 0.9], ids=["worse", "better, but not saved"])
+def test_the_best_and_the_last_weights_are_kept(tmp_path, untrained):
     trainer = make_trainer(
-        results=[0.1, 0.5, 0.3, 0.2],
+        results=[untrained, 0.5, 0.3, 0.2],
         total_frames=30,
         log_frames=10,
         evaluation_frames=10,

@@ -31,13 +31,8 @@ from hdrqn_torchrl.analysis.comparison.panels import (
 )
 from hdrqn_torchrl.analysis.discoveries import found_at
 from hdrqn_torchrl.analysis.estimates import Center, Estimate, Group, TaskResults
+from hdrqn_torchrl.analysis.results import AXES
 
-_AXES = {
-    "frames": "environment frames",
-    "episodes": "training episodes",
-    "updates": "updates of all levels",
-    "wall_seconds": "wall time",
-}
 _UNITS = ((7200.0, 3600.0, "hours"), (180.0, 60.0, "minutes"), (0.0, 1.0, "seconds"))  # from, seconds, name
 
 _DISCOVERY: Any = {"linestyle": "", "marker": "^", "markersize": 5, "markeredgewidth": 0, "alpha": 0.5}
@@ -101,8 +96,8 @@ def plot_curves(
 
 def _unit_of(axis: str, tasks: Sequence[TaskResults]) -> tuple[float, str]:
     """Scale of the positions and the label of their axis."""
-    label = _AXES.get(axis, axis)
-    if axis != "wall_seconds":
+    label = AXES.get(axis, axis)
+    if not axis.endswith("_seconds"):
         return 1.0, label
     longest = max(each.x[-1] for task in tasks for group in task.groups for each in group.estimates.values())
     _, seconds, name = next(unit for unit in _UNITS if longest >= unit[0])

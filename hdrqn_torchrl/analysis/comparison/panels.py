@@ -238,7 +238,7 @@ def add_legend(figure: Figure, handles: list[Any], explained: list[Any], caption
 
 
 def _width(handles: list[Any], rows: int) -> float:
-    """Height in inches of a legend with this number of rows, at 8 points."""
+    """Width in inches of a legend with this number of rows, at 8 points."""
     longest = max((len(handle.get_label()) for handle in handles), default=0)
     return -(-len(handles) // rows) * (0.062 * longest + 0.55)
 

@@ -30,7 +30,8 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
 
     **Info.** ``extrinsic_reward`` (without the obstacle's penalty), ``attained`` (``[K]`` bool, goals reached by this
     step), ``hazard`` (obstacle hit), ``is_success`` (last goal reached, all in order). With ``places``:
-    ``rooms_attained`` (the room or door entered by this step) and ``rooms_available`` (all but the present one).
+    ``rooms_attained`` (the room or door entered, the goals reached by this step) and ``rooms_available`` (all but the
+    place where the agent is; the goals that are left).
 
     **End of episode.** All goals collected: terminated. ``max_steps`` steps: truncated.
 
