@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any
@@ -28,10 +29,12 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.together import folder_of
 from hdrqn_torchrl.runs import layout
+from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.seeds import read_seeds
 from hdrqn_torchrl.runs.variables import search_path, variables
 
 PLUGINS, PACKAGE = "hydra_plugins", "hydra_plugins.hdrqn_torchrl"  # Hydra takes launchers from nowhere else
+_PLUGINS_OF_SWEEPS = {"parallel": ("hydra_joblib_launcher", "sweep"), "search": ("hydra_optuna_sweeper", "search")}
 _LOOK_SECONDS = 0.5
 
 
@@ -245,11 +248,20 @@ def register() -> None:
     """Makes the launchers known to Hydra, as if they lay in its package for plugins."""
     with contextlib.suppress(ModuleNotFoundError):
         import_module(PLUGINS)
-    sys.modules.setdefault(PLUGINS, ModuleType(PLUGINS))
+    if PLUGINS not in sys.modules:
+        sys.modules[PLUGINS] = ModuleType(PLUGINS)
+        sys.modules[PLUGINS].__path__ = []  # a package, which Hydra looks through for others
     package = sys.modules[PACKAGE] = ModuleType(PACKAGE)
     for launcher in (RayLauncher, SlurmLauncher):
         setattr(package, launcher.__name__, launcher)
         Plugins.instance().register(launcher)
+
+
+def refuse_missing(arguments: Sequence[str]) -> None:
+    """Ends the program if the command asks for a plugin of Hydra that is not installed, which Hydra calls unknown."""
+    for sweep, (plugin, extra) in _PLUGINS_OF_SWEEPS.items():
+        if f"sweep={sweep}" in arguments and find_spec(f"{PLUGINS}.{plugin}") is None:
+            raise SettingsError(f"sweep={sweep} needs {plugin}; install it: pip install 'hdrqn_torchrl[{extra}]'.")
 
 
 def _folders(config: DictConfig) -> list[Path]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -90,6 +91,21 @@ def plan(config: RunSettings, folder: Path) -> Plan:
             folder.rmdir()
             folder.parent.rmdir()
     return Plan(run, config, read_choices(run) or choices, resumed=True, checkpoint=checkpoint)
+
+
+def with_groups_of_run(arguments: Sequence[str]) -> list[str]:
+    """Names the groups that a resumed run was composed of, where the command changes settings of theirs.
+
+    ``resume=FOLDER algo.sub_gamma=0.8`` then means the run's algorithm, and not the default one.
+    """
+    values = dict(argument.lstrip("+~").split("=", 1) for argument in arguments if "=" in argument)
+    run = values.get("resume", "auto").strip("'\"")
+    if run in ("auto", "null"):
+        return list(arguments)
+    choices = read_choices(layout.split(Path(run))[0])
+    changed = {key.partition(".")[0] for key in values if "." in key} - values.keys()
+    named = [f"{group}={choices[group]}" for group in sorted(changed & choices.keys())]
+    return [*arguments, *(each for each in named if re.fullmatch(r"\w+=[\w-]+", each))]  # a run folder may be anyone's
 
 
 def refuse_reference(folder: Path) -> None:

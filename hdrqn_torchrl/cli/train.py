@@ -19,7 +19,7 @@ from hdrqn_torchrl.cli import launchers, sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last, print_result, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors
-from hdrqn_torchrl.cli.resuming import Plan, command, plan, record
+from hdrqn_torchrl.cli.resuming import Plan, command, plan, record, with_groups_of_run
 from hdrqn_torchrl.cli.together import plans, train_together
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError
@@ -38,8 +38,12 @@ if TYPE_CHECKING:
 
 def main() -> None:
     """Runs with the arguments of the command line."""
-    sys.argv[1:] = overrides_last(sys.argv[1:])
+    sys.argv[1:] = with_groups_of_run(overrides_last(sys.argv[1:]))
     launchers.register()
+    try:
+        launchers.refuse_missing(sys.argv)
+    except SettingsError as error:
+        sys.exit(f"error: {error}")
     composed()
 
 

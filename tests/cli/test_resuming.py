@@ -17,7 +17,7 @@ from run_folders import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
 
 from hdrqn_torchrl.cli import resuming
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, plan, record
+from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, plan, record, with_groups_of_run
 from hdrqn_torchrl.runs.arguments import SettingsError
 from hdrqn_torchrl.runs.layout import holds_run, split
 from hdrqn_torchrl.runs.settings import as_plain, check
@@ -189,6 +189,22 @@ class TestResumingAFolder:
             plan_for(f"resume={run}", "algo=drqn")
         with pytest.raises(SettingsError, match="experiment=as_in_paper can't be given with resume=FOLDER"):
             plan_for(f"resume={run}", "experiment=as_in_paper")
+
+    def test_settings_are_those_of_the_runs_groups_without_naming_them(self):
+        run = make_run("outputs/a/1", "algo=v1", "env=four_rooms")
+        typed = [f"resume={run}", "algo.gamma=0.8", "env.view=5", "total_frames=800_001"]
+        assert with_groups_of_run(typed) == [*typed, "algo=v1", "env=four_rooms"]
+        with pytest.raises(SettingsError, match=r"(?s):\n  algo\.gamma: 0\.99 -> 0\.8\n  env\.view: 3 -> 5\nLeave"):
+            plan_for(*with_groups_of_run(typed))
+        for given in (["algo=v2", *typed], typed[1:], ["resume=auto", *typed[1:]], ["resume=nowhere", *typed[1:]]):
+            assert with_groups_of_run(given)[: len(given)] == given and "algo=v1" not in with_groups_of_run(given)
+
+    @pytest.mark.parametrize("choice", ["../../elsewhere", "v3 env=mine", "[v3]"])
+    def test_a_run_folder_names_no_file_that_lies_elsewhere(self, choice):
+        run = make_run("outputs/a/1")
+        (run / "run.json").write_text(json.dumps({"choices": {"algo": choice}}))
+        typed = [f"resume={run}", "algo.gamma=0.8"]
+        assert with_groups_of_run(typed) == typed
 
     def test_a_run_without_a_recorded_origin_can_be_resumed(self):
         run = make_run("outputs/a/1", "seed=3", "algo=v1")

@@ -28,6 +28,7 @@ PACKAGES = {
 }
 """Packages that register environments, by how the ids begin. They are imported for these ids."""
 
+_EXTRAS = {"ale_py": "atari", "minigrid": "minigrid"}
 _ON_THE_PATH = "name the folder that holds it: export PYTHONPATH=$PWD"
 
 SomeSubgoals = Subgoals | str | Sequence[Subgoals | str] | None
@@ -168,9 +169,9 @@ def import_package_of(id: str, package: str | None = None) -> None:
         try:
             gymnasium.register_envs(importlib.import_module(name))
         except ImportError as error:
-            raise ImportError(
-                f"{id} needs {name}, which can't be imported ({error}); install it, or {_ON_THE_PATH}."
-            ) from error
+            extra = _EXTRAS.get(name)
+            remedy = f": pip install 'hdrqn_torchrl[{extra}]'" if extra else f", or {_ON_THE_PATH}"
+            raise ImportError(f"{id} needs {name}, which can't be imported ({error}); install it{remedy}.") from error
         if name == "minigrid":
             _silence_babyai()
 
