@@ -21,10 +21,13 @@ names = [each.name for each in session.get_outputs()]
 
 env = gymnasium.make(sys.argv[2])
 for episode in range(int(sys.argv[3])):
-    (observation, info), done, rewards = env.reset(seed=episode), False, []
+    (observation, info), done, rewards, reached = env.reset(seed=episode), False, [], False
     while not done:
         inputs |= {"observation": np.asarray(observation)[None], "is_init": np.array([[not rewards]])}
         inputs |= {name: np.asarray(info[name]).reshape(1, -1) for name in about["observed"] if name in info}
+        if "available" in about["observed"] and "available" not in info:
+            reached = reached | inputs["attained"]
+            inputs["available"] = ~reached  # subgoals that can be attained once in an episode
         outputs = dict(zip(names, session.run(None, inputs), strict=True))
         inputs |= {name: outputs["next_" + name] for name in about["state"]}  # this is all that it remembers
         observation, reward, terminated, truncated, info = env.step(outputs["action"][0])

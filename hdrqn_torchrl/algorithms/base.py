@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
 from hdrqn_torchrl.algorithms.views import LevelView
-from hdrqn_torchrl.envs import Task
+from hdrqn_torchrl.envs import SubgoalSet, Task
 from hdrqn_torchrl.learning import Learner, LearnerSettings, Monitor
 from hdrqn_torchrl.modules import AllSubgoalsPolicy, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.objectives import RecurrentDQNLoss
@@ -51,6 +51,12 @@ class Algorithm:
         """Frames after which each of its subgoals was found; ``None`` if they were given."""
         critic = getattr(self.policy, "critic", None)
         return None if critic is None else critic.table.found.tolist()
+
+    @property
+    def pursued(self) -> tuple[SubgoalSet, ...]:
+        """Sets of subgoals of the task that its levels pursue, from near to far; none if it finds its own."""
+        number = 0 if self.found is not None else len(self.levels) - 1
+        return self.task.subgoals[-number:] if number > 0 else ()
 
     @property
     def updates(self) -> int:

@@ -81,7 +81,7 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
     try:
         if wrong := [argument for argument in arguments if "=" not in argument]:
             raise SettingsError(f"an argument must read key=value, got {wrong[0]!r}; --help shows all of them.")
-        pairs = [argument.split("=", 1) for argument in arguments]
+        pairs = [argument.lstrip("+").split("=", 1) for argument in arguments]  # +: as a training needs it
         texts = {key: value for key, value in pairs if _is_text(schema, key, value)}
         read = [f"{key}={'text' if key in texts else value}" for key, value in pairs]
         try:

@@ -14,6 +14,7 @@ from hdrqn_torchrl.envs.specs import interface_differences
 from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.arguments import SettingsError, shown
 from hdrqn_torchrl.runs.building import build_algorithm, build_env
+from hdrqn_torchrl.runs.facts import warn_of_other_names
 from hdrqn_torchrl.runs.reading import read_config
 from hdrqn_torchrl.runs.settings import RunSettings
 from hdrqn_torchrl.runs.weights import load_policy
@@ -73,6 +74,7 @@ def load_agent(
         if changes:
             refuse_other_interface(build_env(own, {"num_envs": 1, "device": "cpu"}, allowed_targets), env, changes)
         raise SettingsError(str(error)) from error
+    warn_of_other_names(folder, env)
     return Agent(config, algorithm.transform(env), algorithm)
 
 

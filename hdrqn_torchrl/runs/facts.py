@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import warnings
+from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
@@ -55,19 +57,40 @@ def check_facts(folder: Path, facts: Facts) -> None:
     path = folder / layout.TASK
     if not path.exists():
         return
-    stored = read_json(path, root=folder)
-    before = stored if isinstance(stored, dict) else {}
-    changed = [
-        f"{name if name in facts else shown(name)}: {shown(before.get(name, 'none'))} -> {facts.get(name, 'none')}"
-        for name in {**before, **facts}
-        if before.get(name) != facts.get(name)
-    ]
-    if changed:
+    if changed := _changed(path, facts):
         lines = "\n  ".join(changed)
         raise ValueError(
             f"the task must be that of the run that is resumed, and differs from {folder}:\n  {lines}\n"
             "Bring back the environment as it was, or take the new one with resume_override=true."
         )
+
+
+def warn_of_other_names(folder: Path, env: EnvBase) -> None:
+    """Warns if subgoals or actions are called otherwise than when the run was trained: others are meant, perhaps.
+
+    Args:
+        folder: of the run.
+        env: bare environment in which its agent is to play.
+    """
+    path = folder / layout.TASK
+    facts = {name: each for name, each in facts_of(env).items() if name.startswith("names of ")}
+    if path.exists() and (changed := _changed(path, facts, only=facts)):
+        warnings.warn(
+            f"names should be those of the training in {folder}, got others: {'; '.join(changed)}. If their order "
+            "changed, the agent means others than these names say.",
+            stacklevel=3,
+        )
+
+
+def _changed(path: Path, facts: Facts, only: Container[str] | None = None) -> list[str]:
+    """What differs from the stored facts, a line each; of those named by ``only``."""
+    stored = read_json(path, root=path.parent)
+    before = stored if isinstance(stored, dict) else {}
+    return [
+        f"{name if name in facts else shown(name)}: {shown(before.get(name, 'none'))} -> {facts.get(name, 'none')}"
+        for name in {**before, **facts}
+        if before.get(name) != facts.get(name) and (only is None or name in only)
+    ]
 
 
 def write_facts(folder: Path, facts: Facts) -> None:

@@ -28,6 +28,7 @@ from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.saving import Saving
 from hdrqn_torchrl.runs.state_checks import rules_of
+from hdrqn_torchrl.runs.unattained import UnattainedSubgoals
 from hdrqn_torchrl.runs.window import Window, check_counters, crossed, warn_of_clipping
 from hdrqn_torchrl.runs.workers import WorkersCollector
 
@@ -80,6 +81,7 @@ class Trainer:
         self._tracker = EpisodeTracker(algorithm.task)
         self._incoming = Incoming(self._tracker)
         self._window = Window()
+        self._unattained = UnattainedSubgoals(algorithm.pursued)
         self._stop = stop or StopRequest()
         self.clock = Clock()
         self._saving = Saving(checkpoints, self._parts, place=lambda: self._place, seconds=checkpoint_seconds)
@@ -111,10 +113,7 @@ class Trainer:
     def pieces(self) -> Iterator[None]:
         """:meth:`train` in pieces, between which another training may have its turn.
 
-        A piece ends where the host would wait for the device.
-
-        Raises:
-            Exception: as :meth:`train`.
+        A piece ends where the host would wait for the device. It raises what :meth:`train` does.
         """
         try:
             with self._stop:
@@ -173,6 +172,7 @@ class Trainer:
         with self._saving.in_parts():
             self.frames += batch.numel()
             self.algorithm.observe(batch)
+            self._unattained.observe(batch)
             self.episodes += self._window.add_episodes(self._incoming.take(batch))
         self.logger.advance(self.frames)
 
@@ -215,6 +215,7 @@ class Trainer:
             **self.algorithm.figures(),
         }
         warn_of_clipping(row, self.algorithm.learners)
+        self._unattained.warn(self.frames / self.total_frames)
         for monitor in self._reporting:
             row |= monitor.metrics()
         best = False

@@ -45,6 +45,9 @@ class TestCommandLine:
         settings = call(f"run={name}", f"out={name}", f"files={name}")
         assert settings == Settings(name, 10, name, None if name == "null" else name)
 
+    def test_a_plus_before_a_setting_is_as_in_the_command_of_a_training(self, call):
+        assert call("+run=a", "++episodes=3") == Settings("a", 3, None)
+
     def test_a_setting_that_takes_several_reads_a_list(self, call):
         assert call("run=a", "files=[a,'b #c']").files == ["a", "b #c"]
 

@@ -1,11 +1,12 @@
 """A run goes on with the task that it was begun with."""
 
+import warnings
 from dataclasses import replace
 
 import pytest
 from helpers import small_env
 
-from hdrqn_torchrl.runs.facts import check_facts, facts_of, write_facts
+from hdrqn_torchrl.runs.facts import check_facts, facts_of, warn_of_other_names, write_facts
 
 
 def changed(env, **facts):
@@ -44,3 +45,12 @@ def test_a_run_of_an_earlier_version_is_let_pass(tmp_path):
 def test_a_task_that_changed_is_refused_by_what_changed(run, env, line):
     with pytest.raises(ValueError, match=rf"^the task must be that of the run .*\n(  .*\n)*  {line}\n"):
         check_facts(run, facts_of(env()))
+
+
+def test_other_names_are_warned_of_and_another_length_is_not(run):
+    names = replace(small_env().task.subgoals[0], names=("goal 2", "goal 1"))
+    with pytest.warns(UserWarning, match="names of subgoals: 'goal 1, goal 2' -> goal 2, goal 1. If their order"):
+        warn_of_other_names(run, changed(small_env(), subgoals=(names,)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_other_names(run, small_env(max_steps=9))

@@ -77,10 +77,10 @@ def subgoals_of(given: SomeSubgoals) -> tuple[Subgoals, ...]:
     found = [_named("subgoals", each) for each in sets]
     made = tuple(each() if isinstance(each, type) else each for each in found)
     for each in made:
-        if not callable(getattr(each, "conditions", None)) or not getattr(each, "names", None):
+        if not isinstance(each, Subgoals) or not each.names:
             raise ValueError(
-                f"subgoals must have names and a method conditions, got {each!r}; derive a class from "
-                "hdrqn_torchrl.envs.gym.Subgoals."
+                f"subgoals must derive from hdrqn_torchrl.envs.Subgoals and have names, got {each!r}; its methods are "
+                "those of that class."
             )
         _check_set(each)
     prefixes = [each.prefix for each in made]

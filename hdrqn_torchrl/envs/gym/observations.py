@@ -190,7 +190,8 @@ def _joined(encoders: dict[Any, Encoder], where: str) -> Encoder:
     if images:
         raise ValueError(
             f"entries must not mix an image with others, got {[name for name, _ in parts]} with the image {images[0]!r}"
-            f"; choose some (entries=[{images[0]}]), or give their numbers of codes (codes=...) if they hold codes."
+            f"; make one vector of all numbers (wrappers=[gymnasium.wrappers.FlattenObservation]), choose some "
+            f"(entries=[{images[0]}]), or give their numbers of codes (codes=...) if they hold codes."
         )
     if all(isinstance(each.space, spaces.MultiDiscrete) for _, each in parts):
         numbers = np.concatenate([np.asarray(each.space.nvec).reshape(-1) for _, each in parts])  # type: ignore[union-attr]

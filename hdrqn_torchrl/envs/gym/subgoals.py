@@ -135,7 +135,9 @@ class SubgoalRecord:
     def _failure(self, method: str, error: Exception) -> ReturnError:
         """What to say of an error in a user's own method."""
         remedy = ""
-        if isinstance(error, AttributeError):
+        if not self._steps and "NoneType" in str(error) and self.env is not None:
+            remedy = "; before is None at a reset: a condition that compares with it does not hold then"
+        elif isinstance(error, AttributeError):
             if self.env is None:
                 remedy = "; env is None for EnvPool and for vectors made elsewhere: use before, after and info"
             elif error.obj is self.env is not self.env.unwrapped and hasattr(self.env.unwrapped, error.name or ""):

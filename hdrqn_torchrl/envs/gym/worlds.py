@@ -140,7 +140,10 @@ def _applied(rule: str | Rule, reward: float, info: Mapping[str, Any], name: str
     if not isinstance(rule, str):
         return rule(reward, info)
     if rule not in info:
-        raise ValueError(f"{name} must name an entry of info after every step, got {rule!r}; info has {sorted(info)}.")
+        raise ValueError(
+            f"{name} must name an entry of info after every step, got {rule!r}; info has {sorted(info)}. One that is "
+            f"there now and then needs a function: {name}=my_package.function, of (reward, info)."
+        )
     return info[rule]
 
 

@@ -232,6 +232,9 @@ class TestSubgoals:
         env = made_with(lambda env, *_: (env.steps > 1, False), lambda: TimeLimit(Odd(), 9))
         refused("no attribute 'steps', .*; env is what wrappers show of it: use env.unwrapped.steps", env)
 
+    def test_that_compare_with_what_was_before_a_reset_are_told_that_there_is_nothing(self):
+        refused("must not fail, got TypeError: .*, 0 steps .*; before is None at a", made_with(lambda _, b, *__: b[0]))
+
     def test_that_look_into_worlds_which_can_not_be_looked_into_are_told_so(self):
         vector = SyncVectorEnv([Counter] * 2, autoreset_mode=AutoresetMode.DISABLED)
         refused("must not fail, .*; env is None for EnvPool", made_with(lambda env, *_: env.unwrapped, vector))
