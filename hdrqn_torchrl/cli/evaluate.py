@@ -139,7 +139,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
         "env": agent.config.env,
         "seed": seed,
         "epsilon": settings.epsilon,
-        **summarise(played, names=names_of(agent)),
+        **summarise(played, names=names_of(agent), nearer=task.subgoals[:-1]),
         **({"legs": legs_of(observers["legs"])} if "legs" in observers else {}),
         "ceiling": ceiling_of(references, task),
         "references": references,

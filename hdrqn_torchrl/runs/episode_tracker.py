@@ -28,7 +28,8 @@ class EpisodeTracker:
     Args:
         task: says whether subgoals have an order, and which entry marks success.
         per_subgoal: report ``attained``, ``chosen`` and ``reached`` ``[G]`` as well: how often each subgoal was
-            attained, options for it that ended, and those of them that reached it.
+            attained, options for it that ended, and those of them that reached it. Nearer sets of subgoals have
+            the same entries with their prefix (``rooms_attained``, ...).
     """
 
     def __init__(self, task: Task = Task(), *, per_subgoal: bool = False) -> None:  # noqa: B008 (frozen)
@@ -48,7 +49,8 @@ class EpisodeTracker:
             step["in_order"] = self._next_in_order(after)
         step["steps"] = torch.ones_like(step["return"])
         if self.per_subgoal:
-            step |= _subgoal_events(after)
+            for names in (keys.OptionKeys(), *(each.keys for each in self.task.subgoals[:-1])):
+                step |= _subgoal_events(after, names)
         sums = TensorDict(step, after.batch_size, device=after.device)
         if self.sums is not None:
             sums = sums + self.sums
@@ -96,16 +98,14 @@ class EpisodeTracker:
         self.sums, self._in_order = state["sums"], state.get("in_order")
 
 
-def _subgoal_events(after: TensorDictBase) -> dict[str, Tensor]:
-    """What happened to each subgoal in one step, ``[N, G]`` each."""
-    if keys.ATTAINED not in after:
+def _subgoal_events(after: TensorDictBase, names: keys.OptionKeys) -> dict[str, Tensor]:
+    """What happened to each subgoal of a set in one step, ``[N, G]`` each."""
+    if names.attained not in after:
         return {}
-    attained = after.get(keys.ATTAINED).float()
-    if keys.OPTION_DONE not in after:
-        return {"attained": attained}
-    active = torch.nn.functional.one_hot(after.get(keys.ACTIVE_SUBGOAL), attained.shape[-1]).float()
-    return {
-        "attained": attained,
-        "chosen": active * after.get(keys.OPTION_DONE),
-        "reached": active * after.get(keys.SUBGOAL_REACHED),
-    }
+    attained = after.get(names.attained).float()
+    events = {"attained": attained}
+    if names.option_done in after:
+        active = torch.nn.functional.one_hot(after.get(names.active_subgoal), attained.shape[-1]).float()
+        events["chosen"] = active * after.get(names.option_done)
+        events["reached"] = active * after.get(names.subgoal_reached)
+    return {names.of(name): event for name, event in events.items()}

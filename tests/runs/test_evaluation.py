@@ -4,7 +4,7 @@ import pytest
 import torch
 from gym_toys import Counter
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
-from helpers import LEFT, RIGHT, build, collect, small_env, subgoal_env
+from helpers import LEFT, RIGHT, build, collect, house, small_env, subgoal_env
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import ExplorationType, set_exploration_type
@@ -223,6 +223,19 @@ class TestTasksOfOthers:
             evaluate(env, right, episodes=4, max_steps=0)
 
 
+class StepLog:
+    """Counts flags in the steps of episodes that count."""
+
+    def __init__(self):
+        self.steps = []
+
+    def add_step(self, step, counted):
+        self.steps.append(step["next"][counted].clone())
+
+    def total(self, key):
+        return sum(step[key].sum().item() for step in self.steps)
+
+
 class TestPerSubgoal:
     def test_subgoals_attained_and_reached_on_a_scripted_walk_are_counted(self):
         """In a row of three cells, going right from its left end takes both goals."""
@@ -244,6 +257,21 @@ class TestPerSubgoal:
             {"attained": 1.0, "options": 2.0, "success_rate": 0.5},
             {"attained": 1.0, "options": 0.0, "success_rate": None},
         ]
+
+    def test_nearer_sets_have_figures_of_their_own(self):
+        torch.manual_seed(0)
+        base = house(20)
+        algorithm = build("v3", base, levels=3)
+        steps, env = StepLog(), algorithm.transform(base)
+        random = ExplorationType.RANDOM
+        played = play(env, algorithm.policy, episodes=20, observers=[steps], exploration_type=random)
+        (rooms, goals), result = base.task.subgoals, summarise(played, nearer=base.task.subgoals[:-1])
+        assert [each["name"] for each in result["rooms_per_subgoal"]] == list(rooms.names) and len(goals) == 2
+        assert len(result["per_subgoal"]) == 2
+        for name, key in (("chosen", "option_done"), ("reached", "subgoal_reached"), ("attained", "attained")):
+            assert played[f"rooms_{name}"].sum() == steps.total(f"rooms_{key}") > 0
+        options = sum(each["options"] for each in result["rooms_per_subgoal"])
+        assert options * 20 == pytest.approx(steps.total("rooms_option_done"))
 
     def test_flat_agents_have_no_options(self):
         played = play(pair_env(4), always_right(), episodes=4)
