@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from tensordict import NestedKey
+
 # Written by the environment.
 OBSERVATION = "observation"  # cell codes [V, V] or others, pixels [C, height, width] uint8, or a vector [D]: o_t
 REWARD = "reward"  # [1] float32: total reward of the task
@@ -130,3 +132,13 @@ class OptionKeys:
     @property
     def intrinsic_reward(self) -> str:
         return self.of(INTRINSIC_REWARD)
+
+
+def next_key(key: NestedKey) -> tuple[str, ...]:
+    """Where TorchRL puts what comes after a step.
+
+    Examples:
+        >>> next_key("sub_hidden")
+        ('next', 'sub_hidden')
+    """
+    return ("next", *((key,) if isinstance(key, str) else key))

@@ -53,16 +53,6 @@ class Requirements:
     finds_subgoals: bool = False
 
     @property
-    def num_subgoals(self) -> int:
-        """G of the farthest set; 0 for a flat agent."""
-        return len(self.subgoals[-1]) if self.subgoals else 0
-
-    @property
-    def available_key(self) -> NestedKey | None:
-        """The farthest set's entry that marks the subgoals worth choosing, if there is one."""
-        return self.available_keys[-1] if self.available_keys else None
-
-    @property
     def levels(self) -> tuple[Level, ...]:
         """The agent's levels, from level 0 up."""
         return make_levels(self.num_actions, self.subgoals)
@@ -103,8 +93,8 @@ def check_environment(
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
         >>> from hdrqn_torchrl.modules import compact_network
         >>> needs = check_environment(MultiGoalGridEnv(4), compact_network(), builder="make_v3", levels=2)
-        >>> needs.num_actions, needs.num_subgoals, [level.name for level in needs.levels]
-        (4, 2, ['sub', 'meta'])
+        >>> needs.num_actions, [level.name for level in needs.levels]
+        (4, ['sub', 'meta'])
     """
     check_is_environment(env)
     if not isinstance(architecture, Architecture):

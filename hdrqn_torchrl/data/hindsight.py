@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 
 from hdrqn_torchrl import keys
@@ -194,7 +195,7 @@ class HindsightOptions:
             return told
         rows = self.at_start(told.exclude("next")[starts])
         for key in self.pursued.input_keys:
-            told.set(key, told.get(key).masked_scatter(_expand(starts, told.get(key)), rows.get(key)))
+            told.set(key, told.get(key).masked_scatter(expand_as_right(starts, told.get(key)), rows.get(key)))
         return told
 
     def _keep_changed(
@@ -224,7 +225,3 @@ class HindsightOptions:
         self.retold.load_state_dict(state["retold"])
         self._book = None if state["steps"] is None else (state["steps"], state["collected"])
         self._split, self._changed = state["split"], state["changed"]
-
-
-def _expand(mask: Tensor, like: Tensor) -> Tensor:
-    return mask.view(mask.shape + (1,) * (like.ndim - mask.ndim)).expand_as(like)

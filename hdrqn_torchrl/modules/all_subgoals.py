@@ -119,7 +119,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         books = [key for each in subgoal_keys for key in (each.option_init, each.active_subgoal, each.subgoal_mask)]
         masks = [] if action_mask_key is None else [action_mask_key]
         self.in_keys = [observation_key, init_key, *masks, *books, *carried]
-        self.out_keys = [*(each.subgoal for each in subgoal_keys), action_key, *(_next(key) for key in carried)]
+        self.out_keys = [*(each.subgoal for each in subgoal_keys), action_key, *(keys.next_key(key) for key in carried)]
 
     def _check_explorations(self) -> None:
         explorations = self.subgoal_explorations
@@ -174,7 +174,7 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
             tensordict.set(self.action_value_key, wanted)
         tensordict.set(self.action_key, action)
         for key, value in ((self.hidden_key, hidden), (self.cell_key, cell), (self.previous_action_key, action)):
-            tensordict.set(_next(key), value)
+            tensordict.set(keys.next_key(key), value)
         return tensordict
 
     def _choose_subgoals(
@@ -215,7 +215,3 @@ def values_of(action_value: Tensor, subgoal: Tensor) -> Tensor:
     """Selects the values ``[*, A]`` of one subgoal ``[*]`` from those of all ``[*, G, A]``."""
     index = subgoal[..., None, None].expand(*subgoal.shape, 1, action_value.shape[-1])
     return action_value.gather(-2, index).squeeze(-2)
-
-
-def _next(key: NestedKey) -> tuple[str, ...]:
-    return ("next", *((key,) if isinstance(key, str) else key))

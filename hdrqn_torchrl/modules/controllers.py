@@ -100,7 +100,7 @@ class SubController(TensorDictModuleBase):
         self.exploration_keys: list[NestedKey] = list(carried_by(self.exploration, exploration_key))
         carried = [*self.state_keys, *self.exploration_keys]
         self.in_keys += carried
-        self.out_keys = [action_key, *(_next(key) for key in carried)]
+        self.out_keys = [action_key, *(keys.next_key(key) for key in carried)]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
@@ -124,8 +124,8 @@ class SubController(TensorDictModuleBase):
         cell = tensordict.get(self.cell_key).masked_fill(init, 0.0)
         value, (hidden, cell) = self.network.step(observation, subgoal, (hidden, cell))
         tensordict.set(self.action_key, self._choose(value, tensordict))
-        tensordict.set(_next(self.hidden_key), hidden)
-        return tensordict.set(_next(self.cell_key), cell)
+        tensordict.set(keys.next_key(self.hidden_key), hidden)
+        return tensordict.set(keys.next_key(self.cell_key), cell)
 
     def _choose(self, value: Tensor, tensordict: TensorDictBase) -> Tensor:
         subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
@@ -243,7 +243,7 @@ class MetaController(TensorDictModuleBase):
         self.exploration_keys: list[NestedKey] = list(self._carried)
         self.acting_keys += self.exploration_keys
         self.in_keys += self.state_keys
-        self.out_keys = [subgoal_key, *(_next(key) for key in (*self.state_keys, *self.exploration_keys))]
+        self.out_keys = [subgoal_key, *(keys.next_key(key) for key in (*self.state_keys, *self.exploration_keys))]
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
@@ -268,7 +268,7 @@ class MetaController(TensorDictModuleBase):
                 state = state[0].masked_fill(init, 0.0), state[1].masked_fill(init, 0.0)
             value, advanced = self.network.step(inputs, condition, state)
             for key, new, old in zip((self.hidden_key, self.cell_key), advanced, state, strict=True):
-                tensordict.set(_next(key), torch.where(gate, new, old))
+                tensordict.set(keys.next_key(key), torch.where(gate, new, old))
         else:
             value = self.network.evaluate(inputs, condition)
         mask = None if self.mask_key is None else tensordict.get(self.mask_key)
@@ -287,10 +287,6 @@ def first_state(tensordict: TensorDictBase, state_keys: Sequence[NestedKey]) -> 
         return None
     hidden, cell = (tensordict.get(key) for key in state_keys)
     return hidden[:, 0], cell[:, 0]
-
-
-def _next(key: NestedKey) -> tuple[str, ...]:
-    return ("next", *((key,) if isinstance(key, str) else key))
 
 
 def _primer(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
-from tensordict.utils import unravel_key
+from tensordict.utils import expand_as_right, unravel_key
 from torch import Tensor
 
 from hdrqn_torchrl.devices import on_host
@@ -91,7 +91,7 @@ def _joined(now: Tensor, following: Tensor, valid: Tensor) -> Tensor:
     stream = torch.cat([now, following[:, -1:]], 1)
     if _padding(valid) is None:
         return stream
-    return torch.where(_expand(_with_nothing(valid), stream), stream, torch.cat([now[:, :1], following], 1))
+    return torch.where(expand_as_right(_with_nothing(valid), stream), stream, torch.cat([now[:, :1], following], 1))
 
 
 def step_of(value: Tensor, tensordict: TensorDictBase) -> Tensor:
@@ -121,13 +121,9 @@ def _padding(valid: Tensor) -> Tensor | None:
 
 def _clear(value: Tensor, void: Tensor) -> Tensor:
     """Entries ``[B, T, ...]``, zero where they are ``void``."""
-    return value.masked_fill(_expand(void, value), 0.0)
+    return value.masked_fill(expand_as_right(void, value), 0.0)
 
 
 def _with_nothing(value: Tensor) -> Tensor:
     """Entries ``[B, T, ...]`` with one more step at the end, where they are zero or false."""
     return torch.cat([value, torch.zeros_like(value[:, :1])], 1)
-
-
-def _expand(mask: Tensor, like: Tensor) -> Tensor:
-    return mask.view(mask.shape + (1,) * (like.ndim - mask.ndim))

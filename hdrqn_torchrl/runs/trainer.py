@@ -25,11 +25,11 @@ from hdrqn_torchrl.runs.components import components_of
 from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.incoming import Incoming
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
+from hdrqn_torchrl.runs.log_interval import LogInterval, check_counters, crossed, warn_of_clipping
 from hdrqn_torchrl.runs.logging import Row, RunLogger
 from hdrqn_torchrl.runs.saving import Saving
 from hdrqn_torchrl.runs.state_checks import rules_of
 from hdrqn_torchrl.runs.unattained import UnattainedSubgoals
-from hdrqn_torchrl.runs.window import Window, check_counters, crossed, warn_of_clipping
 from hdrqn_torchrl.runs.workers import WorkersCollector
 
 
@@ -80,7 +80,7 @@ class Trainer:
         self._completed: int | None = None  # frames at the end of the last complete iteration; None: not begun
         self._tracker = EpisodeTracker(algorithm.task)
         self._incoming = Incoming(self._tracker)
-        self._window = Window()
+        self._interval = LogInterval()
         self._unattained = UnattainedSubgoals(algorithm.pursued)
         self._stop = stop or StopRequest()
         self.clock = Clock()
@@ -173,7 +173,7 @@ class Trainer:
             self.frames += batch.numel()
             self.algorithm.observe(batch)
             self._unattained.observe(batch)
-            self.episodes += self._window.add_episodes(self._incoming.take(batch))
+            self.episodes += self._interval.add_episodes(self._incoming.take(batch))
         self.logger.advance(self.frames)
 
     def _complete_iteration(self) -> Iterator[None]:
@@ -182,7 +182,7 @@ class Trainer:
             with naming(name):
                 for _ in range(learner.updates_due()):
                     self._stop.check()
-                    self._window.add_update(name, learner.learn())
+                    self._interval.add_update(name, learner.learn())
             yield
             with naming(name):
                 learner.check_finite(late=self.frames < self.total_frames)
@@ -205,13 +205,13 @@ class Trainer:
 
     def log(self, *, evaluation: bool) -> bool:
         """Writes one log point, after a greedy evaluation if asked for. Returns whether that was the best so far."""
-        self.episodes += self._window.add_episodes(self._incoming.settle())
+        self.episodes += self._interval.add_episodes(self._incoming.settle())
         row: Row = {
             "frames": self.frames,
             "episodes": self.episodes,
             "updates": self.updates,
             **{name: round(seconds, 2) for name, seconds in self.clock.state_dict().items()},
-            **self._window.summary(self.frames),
+            **self._interval.summary(self.frames),
             **self.algorithm.figures(),
         }
         warn_of_clipping(row, self.algorithm.learners)
@@ -232,14 +232,14 @@ class Trainer:
             if best:
                 self.best_return = result["return_mean"]
             self.logger.log(row)
-            self._window = Window(self.frames)  # only now that the row is on the disk: nothing that was counted is lost
+            self._interval = LogInterval(self.frames)  # only now: what it counted is on the disk
             for monitor in self._reporting:
                 monitor.clear()
         return best
 
     def save(self, *, score: float | None = None) -> None:
         """Writes a checkpoint, unless nothing happened since the last one (:meth:`Saving.save`)."""
-        self.episodes += self._window.add_episodes(self._incoming.settle())
+        self.episodes += self._interval.add_episodes(self._incoming.settle())
         self._saving.save(self.frames, score=score)
 
     def resume(self, path: Path) -> None:
@@ -275,7 +275,7 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Its own counters; the parts have theirs."""
-        self.episodes += self._window.add_episodes(self._incoming.settle())
+        self.episodes += self._interval.add_episodes(self._incoming.settle())
         return {
             "frames": self.frames,
             "episodes": self.episodes,
@@ -283,7 +283,7 @@ class Trainer:
             "completed": self._completed,
             **self.clock.state_dict(),
             "tracker": self._tracker.state_dict(),
-            "window": self._window.state_dict(),
+            "window": self._interval.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -297,4 +297,4 @@ class Trainer:
         self._completed = state["completed"]
         self.clock.load_state_dict(state)
         self._tracker.load_state_dict(state["tracker"])
-        self._window.load_state_dict(state["window"])
+        self._interval.load_state_dict(state["window"])

@@ -735,7 +735,7 @@ class TestPrediction:
 
     def test_a_network_without_memory_has_none(self):
         with pytest.raises(ValueError, match="predictor must be None with recurrent=False"):
-            build("hdqn", small_env(4), prediction_steps=1)
+            build("v1", small_env(4), prediction_steps=1, recurrent=False)
 
 
 def _init_of(loss, sample):

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.devices import on_host
-from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules, GridState, StepEvents
+from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridEvents, GridRules, GridState
 from hdrqn_torchrl.envs.grid.task import ROOMS, grid_task
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
 
@@ -259,7 +259,7 @@ class MultiGoalGridEnv(EnvBase):
             if (found.dtype, found.shape) != (own.dtype, own.shape) or (found < 0).any():
                 raise ValueError(f"{name} must be like {own.dtype} {list(own.shape)}; use another checkpoint.")
 
-    def _outcome(self, before: Tensor, events: StepEvents) -> TensorDictBase:
+    def _outcome(self, before: Tensor, events: GridEvents) -> TensorDictBase:
         terminated = events.all_collected
         truncated = (self.steps >= self.max_steps) & ~terminated
         columns = {

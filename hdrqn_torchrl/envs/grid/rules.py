@@ -35,7 +35,7 @@ class GridState(NamedTuple):
     in_order: Tensor
 
 
-class StepEvents(NamedTuple):
+class GridEvents(NamedTuple):
     """What one step did. ``reward``, ``extrinsic_reward`` ``[N]`` float; ``hazard``, ``success``, ``all_collected``
     ``[N]`` bool; ``attained`` ``[N, K]`` bool."""
 
@@ -214,7 +214,7 @@ class GridRules:
 
     def step(
         self, state: GridState, action: Tensor, generator: torch.Generator | None = None
-    ) -> tuple[GridState, StepEvents]:
+    ) -> tuple[GridState, GridEvents]:
         """Moves every agent once. ``action`` ``[N]`` int64 indexes :data:`ACTIONS`.
 
         Reward: -1 where the agent ends on an obstacle; +1 for a goal reached in order; 0.01 for any other, that
@@ -235,7 +235,7 @@ class GridRules:
             objects = self._move_hit_obstacles(agent, objects, met, generator)
         all_collected = collected_bits + attained_bits == 2**self.num_goals - 1
         success = all_collected & in_order
-        events = StepEvents(extrinsic - hazard.float(), extrinsic, hazard, attained, success, all_collected)
+        events = GridEvents(extrinsic - hazard.float(), extrinsic, hazard, attained, success, all_collected)
         return GridState(agent, objects, in_order | (state.in_order & ~reached)), events
 
     def _move_hit_obstacles(

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hdrqn_torchrl.envs.grid.drawing import draw_worlds
-from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridRules, GridState, StepEvents
+from hdrqn_torchrl.envs.grid.rules import ACTIONS, GridEvents, GridRules, GridState
 from hdrqn_torchrl.envs.grid.task import ROOMS
 
 
@@ -111,7 +111,7 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
         self.steps = 0
         none = torch.zeros(1)
         never, attained = none.bool(), torch.zeros((1, self.rules.num_goals), dtype=torch.bool)
-        events = StepEvents(none, none, never, attained, never, never)
+        events = GridEvents(none, none, never, attained, never, never)
         return self._observation(), self._info(self.state.agent, events)
 
     def step(self, action: np.int64 | int) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
@@ -158,7 +158,7 @@ class MultiGoalGymEnv(gymnasium.Env[np.ndarray, np.int64]):
         assert self.state is not None
         return self.rules.observe(self.state)[0].numpy()
 
-    def _info(self, before: Tensor, events: StepEvents) -> dict[str, Any]:
+    def _info(self, before: Tensor, events: GridEvents) -> dict[str, Any]:
         assert self.state is not None
         info = {
             "extrinsic_reward": events.extrinsic_reward.item(),

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from hdrqn_torchrl.runs.window import Window
+from hdrqn_torchrl.runs.log_interval import LogInterval
 
 
 def episodes(returns, attained=None):
@@ -13,7 +13,7 @@ def episodes(returns, attained=None):
 
 
 def test_a_log_point_averages_episodes_and_updates():
-    window = Window(frames=100)
+    window = LogInterval(frames=100)
     window.add_episodes([episodes([1.0, 2.0])])
     window.add_episodes([episodes([6.0])])
     for loss in (1.0, 3.0):
@@ -23,13 +23,13 @@ def test_a_log_point_averages_episodes_and_updates():
 
 
 def test_without_episodes_there_are_no_columns_of_episodes():
-    window = Window()
+    window = LogInterval()
     window.add_episodes([episodes([])])
     assert set(window.summary(10)) == {"frames_per_second"}
 
 
 def test_a_restored_window_continues_where_the_other_was():
-    window, other = Window(frames=50), Window()
+    window, other = LogInterval(frames=50), LogInterval()
     window.add_episodes([episodes([1.0])])
     window.add_update("sub", {"loss": torch.tensor(4.0)})
     other.load_state_dict(window.state_dict())

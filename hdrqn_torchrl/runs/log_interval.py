@@ -18,17 +18,17 @@ from hdrqn_torchrl.runs.logging import Row
 _MOST = 2**53  # the largest count that a number in a table shows exactly
 
 
-class Window:
+class LogInterval:
     """What happened since the last log point; tensors stay on their device until they are summed up.
 
     Args:
         frames: of the training at that log point.
 
     Examples:
-        >>> window = Window(frames=1_000)
-        >>> window.add_update("sub", {"loss": torch.tensor(1.0)})
-        >>> window.add_update("sub", {"loss": torch.tensor(2.0)})
-        >>> window.summary(1_500)["sub/loss"]
+        >>> interval = LogInterval(frames=1_000)
+        >>> interval.add_update("sub", {"loss": torch.tensor(1.0)})
+        >>> interval.add_update("sub", {"loss": torch.tensor(2.0)})
+        >>> interval.summary(1_500)["sub/loss"]
         1.5
     """
 
