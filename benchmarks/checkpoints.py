@@ -16,9 +16,9 @@ import torch
 from hdrqn_torchrl.algorithms import make_drqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
-from hdrqn_torchrl.runs.collectors import ResumableCollector
+from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
 from hdrqn_torchrl.runs.logging import RunLogger
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.trainer import Trainer
 
 INTERVAL_FRAMES = 50_000  # of conf/config.yaml

@@ -29,7 +29,7 @@ from hdrqn_torchrl.devices import set_deterministic
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import compact_network, paper_network
-from hdrqn_torchrl.runs.captured_collector import CapturedCollector
+from hdrqn_torchrl.runs.collectors.captured import CapturedCollector
 
 
 def seconds_per_call(work: Callable[[], object], calls: int, *, before: int = 20) -> float:

@@ -24,8 +24,8 @@ from hdrqn_torchrl.algorithms import make_v3
 from hdrqn_torchrl.algorithms.presets import V3_LEARNER
 from hdrqn_torchrl.envs import make_gym
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.runs.collectors import ResumableCollector
-from hdrqn_torchrl.runs.workers import ProcessWorkers, Worker, WorkersCollector
+from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
+from hdrqn_torchrl.runs.collectors.workers import ProcessWorkers, Worker, WorkersCollector
 
 
 class TimedWorker(Worker):
@@ -80,7 +80,7 @@ def by_workers(kind: str, workers: int, *, worlds: int, steps: int, sync: bool, 
     """So many workers, after two rounds."""
     make = partial(TimedWorker, partial(part, worlds // workers), steps=steps, all_worlds=worlds, threads=1)
     if kind == "ray":
-        from hdrqn_torchrl.runs.workers.ray_workers import RayWorkers
+        from hdrqn_torchrl.runs.collectors.workers.ray_workers import RayWorkers
 
         place = RayWorkers(make, workers=workers)
     else:

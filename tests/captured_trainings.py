@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from helpers import make_training, seed_everything, small_env
 
-from hdrqn_torchrl.runs.captured_collector import CapturedCollector
+from hdrqn_torchrl.runs.collectors.captured import CapturedCollector
 from hdrqn_torchrl.runs.interruption import Interrupted
 from hdrqn_torchrl.runs.trainer import Trainer
 

@@ -24,10 +24,10 @@ from hdrqn_torchrl.algorithms import Algorithm, make_dqn, make_drqn, make_hdqn, 
 from hdrqn_torchrl.envs import MultiGoalGridEnv
 from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
-from hdrqn_torchrl.runs.collectors import ResumableCollector
+from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
 from hdrqn_torchrl.runs.evaluation import evaluate
 from hdrqn_torchrl.runs.logging import RunLogger
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.trainer import Trainer
 from hdrqn_torchrl.transforms import SubgoalTransform
 

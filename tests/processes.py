@@ -19,7 +19,9 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 os.environ["RL_LOGGING_LEVEL"], os.environ["OMP_NUM_THREADS"] = "WARNING", "1"
 FORK = multiprocessing.get_context("forkserver")
-FORK.set_forkserver_preload(["helpers", "processes", "hdrqn_torchrl.cli.train", "hdrqn_torchrl.runs.folder"])
+FORK.set_forkserver_preload(
+    ["helpers", "processes", "hdrqn_torchrl.cli.train", "hdrqn_torchrl.runs.persistence.folder"]
+)
 
 
 def start(target, *arguments) -> BaseProcess:

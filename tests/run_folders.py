@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 
 from hdrqn_torchrl.cli import configuration
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.runs.building import build_algorithm
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
-from hdrqn_torchrl.runs.weights import save_weights
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.persistence.weights import save_weights
+from hdrqn_torchrl.runs.settings.building import build_algorithm
 
 CONF = str(configuration.CONF)
 SMALL = ("network.hidden_size=8", "network.widths=[8]", "env.view=3", "env.num_envs=4", "algo.sub.batch_size=4")
@@ -65,7 +65,7 @@ HOSTILE = {
     "in a list": lambda: changed(logger__loggers=[MAKE]),
     "in a list of lists": lambda: changed(env__layout=[["#"], [{"rows": [MAKE]}]]),
     "through a module of the package": lambda: changed(
-        network=MAKE | {"_target_": "hdrqn_torchrl.runs.durable.os.makedirs"}
+        network=MAKE | {"_target_": "hdrqn_torchrl.runs.persistence.durable.os.makedirs"}
     ),
     "through a class of the package": lambda: changed(
         env={"_target_": "hdrqn_torchrl.learning.LearnerSettings.__init__.__globals__"}

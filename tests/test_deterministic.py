@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from hdrqn_torchrl.devices import WORKSPACE, set_deterministic
 from hdrqn_torchrl.learning import learner as learner_module
 from hdrqn_torchrl.learning.captured import Captured
-from hdrqn_torchrl.runs.checkpoint import RandomState
+from hdrqn_torchrl.runs.persistence.checkpoint import RandomState
 
 NAMES = ("drqn", "v2", "v3")
 

@@ -24,8 +24,8 @@ from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.cli.zoo import as_settings
 from hdrqn_torchrl.envs import check_task
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.commands import PROGRAMS
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.commands import PROGRAMS
 
 ROOT = Path(__file__).parents[1]
 README, PARTS = ROOT / "README.md", ROOT / "docs/parts.md"

@@ -16,7 +16,7 @@ from processes import Diary, leftovers, limited_file_size, start, train_with_dia
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.learning.finite import NonFiniteError
-from hdrqn_torchrl.runs.durable import verify
+from hdrqn_torchrl.runs.persistence.durable import verify
 
 INTERVAL = 32  # frames: every batch is saved
 

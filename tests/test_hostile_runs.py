@@ -21,9 +21,9 @@ from hdrqn_torchrl.analysis import archives
 from hdrqn_torchrl.cli import evaluate, findings, plot, train
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.reading import read_config
-from hdrqn_torchrl.runs.settings import check
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.reading import read_config
+from hdrqn_torchrl.runs.settings.run_settings import check
 
 BIG = 200 << 30
 

@@ -5,7 +5,8 @@ from functools import cache
 from pathlib import Path
 
 import hdrqn_torchrl
-from hdrqn_torchrl.runs import commands, layout
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.settings import commands
 
 ORDER = (
     "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "discovery", "algorithms",
@@ -78,7 +79,7 @@ def texts_of(path):
 def test_only_one_module_spells_the_file_names_of_a_run_folder():
     names = {*layout.WRITTEN, layout.CHECKPOINTS, layout.EVALUATIONS}
     others = [path for path in FILES if path.name != "configuration.py"]  # conf/ has a config.yaml, too
-    assert set(broken(lambda path: texts_of(path) & names, others)) == {"runs/layout.py"}
+    assert set(broken(lambda path: texts_of(path) & names, others)) == {"runs/persistence/layout.py"}
 
 
 PROGRAMS = {f"hdrqn_torchrl.cli.{name}" for name in commands.PROGRAMS}

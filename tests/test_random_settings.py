@@ -19,7 +19,7 @@ from programs import CONF
 from hdrqn_torchrl.cli import train
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 VALUES = (
     "0", "1", "2", "3", "-1", "7", "1000", "0.5", "1.5", "-0.5", "1e3", "inf", "nan", "null", "true", "abc", "''",

@@ -15,8 +15,8 @@ from helpers import check_same, check_same_checkpoint, house, make_training, see
 from hdrqn_torchrl.discovery import Chosen
 from hdrqn_torchrl.envs import make_gym, make_minigrid
 from hdrqn_torchrl.learning import PhaseOne
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.interruption import Interrupted
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 
 BATCH = 32  # frames; see make_training
 

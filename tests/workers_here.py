@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hdrqn_torchrl.runs.workers import PlaceLost, Worker, WorkerLost
+from hdrqn_torchrl.runs.collectors.workers import PlaceLost, Worker, WorkerLost
 
 
 class HereWorkers:

@@ -28,7 +28,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.discovery import DiscoverySettings, EventCritic
 from hdrqn_torchrl.envs import MultiGoalGridEnv, make_minigrid, task_of
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 _ROOM = ("#####", "#   #", "#   #", "#   #", "#####")
 _STEPS = 20  # of a batch, as in a training

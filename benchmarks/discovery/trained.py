@@ -27,9 +27,9 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.runs import load_agent
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.building import build_env
 from hdrqn_torchrl.runs.isolation import isolated
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.building import build_env
 
 TOLD = "told"
 

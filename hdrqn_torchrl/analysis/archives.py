@@ -7,7 +7,7 @@ import tarfile
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
-from hdrqn_torchrl.runs import layout
+from hdrqn_torchrl.runs.persistence import layout
 
 LARGEST_ARCHIVE = 256 << 20
 """Bytes, unpacked; a hundred times what all studies take."""

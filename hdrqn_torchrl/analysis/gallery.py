@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from hdrqn_torchrl.runs import layout
 from hdrqn_torchrl.runs.cards import Card
+from hdrqn_torchrl.runs.persistence import layout
 
 HEADER = (
     "| agent | task | algorithm | frames | seed | commit | return | success | steps | episodes |\n"

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from hdrqn_torchrl.analysis.results import Run
-from hdrqn_torchrl.runs.comparing import NOT_COMPARED, NOT_THE_TASK, NOT_THE_WORLDS, flat
+from hdrqn_torchrl.runs.settings.comparing import NOT_COMPARED, NOT_THE_TASK, NOT_THE_WORLDS, flat
 
 NONE = "none"
 """Label of a setting that a run does not have."""

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.files import RunFileError, read_json, read_text
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json, read_text
 
 Metrics = dict[str, list[float]]
 References = dict[str, dict[str, float]]

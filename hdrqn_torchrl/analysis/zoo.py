@@ -19,10 +19,11 @@ import yaml
 
 from hdrqn_torchrl.analysis.episodes import summarise
 from hdrqn_torchrl.rendering import excerpt, record_episodes, write_video
-from hdrqn_torchrl.runs import Agent, layout, load_agent, play, save_weights
+from hdrqn_torchrl.runs import Agent, load_agent, play, save_weights
 from hdrqn_torchrl.runs.cards import Card
-from hdrqn_torchrl.runs.files import read_json, write_whole
-from hdrqn_torchrl.runs.stored_settings import read_settings
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import read_json, write_whole
+from hdrqn_torchrl.runs.settings.stored_settings import read_settings
 
 WORLDS = 50
 """Played at the same time."""

@@ -6,7 +6,7 @@ import sys
 from importlib import import_module
 
 from hdrqn_torchrl import __version__
-from hdrqn_torchrl.runs.commands import PROGRAMS
+from hdrqn_torchrl.runs.settings.commands import PROGRAMS
 
 USAGE = f"usage: hdrqn {'|'.join(PROGRAMS)} [key=value ...]; `hdrqn PROGRAM --help` explains each"
 

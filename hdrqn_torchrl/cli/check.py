@@ -20,10 +20,10 @@ from omegaconf import open_dict
 
 from hdrqn_torchrl.cli.command_line import overrides_last, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, resolved
-from hdrqn_torchrl.runs.arguments import SettingsError, remedy
-from hdrqn_torchrl.runs.building import build, build_env
-from hdrqn_torchrl.runs.commands import as_called, command_of
-from hdrqn_torchrl.runs.settings import RunSettings, check
+from hdrqn_torchrl.runs.settings.arguments import SettingsError, remedy
+from hdrqn_torchrl.runs.settings.building import build, build_env
+from hdrqn_torchrl.runs.settings.commands import as_called, command_of
+from hdrqn_torchrl.runs.settings.run_settings import RunSettings, check
 
 WORLDS = 4
 

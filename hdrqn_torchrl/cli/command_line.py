@@ -14,8 +14,8 @@ from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.commands import as_called
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.commands import as_called
 
 
 def check_place(path: Path, key: str) -> None:

@@ -11,9 +11,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import hdrqn_torchrl
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.settings import RunSettings, settings_of
-from hdrqn_torchrl.runs.trust import imports_of
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.run_settings import RunSettings, settings_of
+from hdrqn_torchrl.runs.settings.trust import imports_of
 
 ConfigStore.instance().store(name="schema", node=RunSettings)
 _PACKAGE = Path(hdrqn_torchrl.__file__).parent

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from hdrqn_torchrl.analysis.grouping import Entry, task_key, task_of
 from hdrqn_torchrl.analysis.results import References, curve, find_runs, read_run
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import TARGET, SettingsError
-from hdrqn_torchrl.runs.reading import read_choices
-from hdrqn_torchrl.runs.stored_settings import read_settings
-from hdrqn_torchrl.runs.trust import BUILDERS
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.settings.arguments import TARGET, SettingsError
+from hdrqn_torchrl.runs.settings.reading import read_choices
+from hdrqn_torchrl.runs.settings.stored_settings import read_settings
+from hdrqn_torchrl.runs.settings.trust import BUILDERS
 
 BROKEN = (ValueError, TypeError, KeyError, OSError)
 
@@ -81,8 +81,8 @@ def players(settings: str, *, simulate: bool) -> References:
     if task.get(TARGET) not in BUILDERS["env"]:  # a user's own: nobody has declared it trusted
         return {}
     from hdrqn_torchrl.envs import task_of as stated_by  # takes seconds: it loads torch
-    from hdrqn_torchrl.runs.building import build
     from hdrqn_torchrl.runs.references import references_for
+    from hdrqn_torchrl.runs.settings.building import build
 
     try:
         env = build(task | {"num_envs": 1}, place="env")

@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import MISSING
 
 from hdrqn_torchrl.cli.command_line import check_place, command_line, results_alone
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase

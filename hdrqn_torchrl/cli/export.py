@@ -25,7 +25,7 @@ from pathlib import Path
 from omegaconf import MISSING
 
 from hdrqn_torchrl.cli.command_line import check_place, command_line
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 LARGEST_DIFFERENCE = 1e-5
 """Of Q-values; sums in another order are in the range of 1e-6."""

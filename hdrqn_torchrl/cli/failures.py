@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 import hdrqn_torchrl
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan, command
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.files import write_whole
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import write_whole
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.runs.trainer import Trainer
@@ -66,7 +66,7 @@ def _told(error: Exception, run: Plan, trainer: Trainer | None) -> Exception:
     from torchrl.checkpoint import CheckpointError
 
     from hdrqn_torchrl.learning.finite import NonFiniteError
-    from hdrqn_torchrl.runs.workers import WorkerError
+    from hdrqn_torchrl.runs.collectors.workers import WorkerError
 
     goes_on = f"`{command(run.folder, run.config.allowed_targets)}`"
     if isinstance(error, CheckpointError):  # it says what was saved
@@ -88,7 +88,7 @@ def _told(error: Exception, run: Plan, trainer: Trainer | None) -> Exception:
 
 def _is_ours(error: Exception) -> bool:
     """Whether it was raised by this package, in words for its user, or by the machine."""
-    from hdrqn_torchrl.runs.workers import WorkerError
+    from hdrqn_torchrl.runs.collectors.workers import WorkerError
 
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
     return isinstance(error, (OSError, WorkerError)) or Path(frame.f_code.co_filename).is_relative_to(_OURS)
@@ -96,7 +96,7 @@ def _is_ours(error: Exception) -> bool:
 
 def _in_training(error: Exception, run: Plan, trainer: Trainer, goes_on: str) -> str:
     """A paragraph: what, where, what is left, and how to go on."""
-    from hdrqn_torchrl.runs.checkpoint import Checkpoints
+    from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 
     newest = Checkpoints(run.folder / layout.CHECKPOINTS).newest()
     what = str(error) if _is_ours(error) else f"{type(error).__name__}: {error}"

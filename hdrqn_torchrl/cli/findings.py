@@ -14,10 +14,10 @@ from hdrqn_torchrl.analysis.archives import unpack
 from hdrqn_torchrl.analysis.grouping import Entry
 from hdrqn_torchrl.cli.entries import note, read_entries
 from hdrqn_torchrl.cli.studies import Job, is_run_of, jobs_of
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.comparing import NOT_LEARNED_FROM, flat
-from hdrqn_torchrl.runs.files import RunFileError, read_json
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.comparing import NOT_LEARNED_FROM, flat
 
 
 @dataclass(frozen=True)

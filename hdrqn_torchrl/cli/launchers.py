@@ -28,10 +28,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.together import folder_of
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.seeds import read_seeds
-from hdrqn_torchrl.runs.variables import search_path, variables
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.seeds import read_seeds
+from hdrqn_torchrl.runs.settings.variables import search_path, variables
 
 PLUGINS, PACKAGE = "hydra_plugins", "hydra_plugins.hdrqn_torchrl"  # Hydra takes launchers from nowhere else
 _PLUGINS_OF_SWEEPS = {"parallel": ("hydra_joblib_launcher", "sweep"), "search": ("hydra_optuna_sweeper", "search")}
@@ -132,7 +132,7 @@ class RayLauncher(ElsewhereLauncher):
         self.cores_per_job, self.gpus_per_job = cores_per_job, gpus_per_job
 
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
-        from hdrqn_torchrl.runs.workers.ray_cluster import RayCluster, load_ray
+        from hdrqn_torchrl.runs.collectors.workers.ray_cluster import RayCluster, load_ray
 
         os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")
         try:

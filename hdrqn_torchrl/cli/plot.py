@@ -51,8 +51,8 @@ from hdrqn_torchrl.analysis.results import (
 )
 from hdrqn_torchrl.cli.command_line import as_list, command_line
 from hdrqn_torchrl.cli.entries import common_references, note, read_entries, shortened
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 ALLOWED = {
     "kind": ("curves", "greedy", "discovery", "bars"),

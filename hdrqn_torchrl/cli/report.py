@@ -37,9 +37,9 @@ from hdrqn_torchrl.cli.entries import common_references, note
 from hdrqn_torchrl.cli.findings import Found, Runs, read_runs, runs_of_jobs
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.files import RunFileError, read_json
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 SIZES = ("small", "paper")
 QUANTITIES = ("return", "success", "in_order", "steps")

@@ -23,14 +23,14 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from hdrqn_torchrl.cli.configuration import plain
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.building import default_of
-from hdrqn_torchrl.runs.commands import command_of
-from hdrqn_torchrl.runs.comparing import BOOKKEEPING, flat
-from hdrqn_torchrl.runs.reading import read_choices, read_config
-from hdrqn_torchrl.runs.settings import RunSettings, Settings, as_plain, check, settings_of
-from hdrqn_torchrl.runs.stored_settings import INTERPOLATION
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.building import default_of
+from hdrqn_torchrl.runs.settings.commands import command_of
+from hdrqn_torchrl.runs.settings.comparing import BOOKKEEPING, flat
+from hdrqn_torchrl.runs.settings.reading import read_choices, read_config
+from hdrqn_torchrl.runs.settings.run_settings import RunSettings, Settings, as_plain, check, settings_of
+from hdrqn_torchrl.runs.settings.stored_settings import INTERPOLATION
 
 FOLLOWS = "learning_rate_frames"
 """Settings of this name that are equal to ``total_frames`` are raised with it."""
@@ -276,7 +276,7 @@ def _without_copies(settings: dict[str, Any]) -> dict[str, Any]:
 
 def record(run: Plan) -> None:
     """Writes ``config.yaml`` and, at the beginning, ``run.json`` (where the run comes from)."""
-    from hdrqn_torchrl.runs.files import write_whole
+    from hdrqn_torchrl.runs.persistence.files import write_whole
 
     if not (run.folder / layout.ORIGIN).exists():
         origin = {

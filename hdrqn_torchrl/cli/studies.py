@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from hdrqn_torchrl.analysis.claims import Alike, Claim, Near, Ordered
 from hdrqn_torchrl.analysis.comparison import GREEDY, PAPER, Panel
 from hdrqn_torchrl.cli.configuration import CONF, plain
-from hdrqn_torchrl.runs.comparing import NOT_LEARNED_FROM, flat
+from hdrqn_torchrl.runs.settings.comparing import NOT_LEARNED_FROM, flat
 
 _LEFT_TO_THE_TASK = ("max_target", "max_meta_target", "slice_len")  # null: as the task states its returns and episodes
 ALGORITHMS = (  # the first three are the paper's

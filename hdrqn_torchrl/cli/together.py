@@ -14,8 +14,8 @@ from omegaconf import DictConfig
 from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.configuration import RunError, resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, plan
-from hdrqn_torchrl.runs.seeds import read_seeds
-from hdrqn_torchrl.runs.settings import check, pick_device
+from hdrqn_torchrl.runs.settings.run_settings import check, pick_device
+from hdrqn_torchrl.runs.settings.seeds import read_seeds
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.runs.interruption import StopRequest

@@ -21,11 +21,11 @@ from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, record, with_groups_of_run
 from hdrqn_torchrl.cli.together import plans, train_together
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.building import build, build_algorithm, build_env
-from hdrqn_torchrl.runs.files import check_file, remove, replaced
-from hdrqn_torchrl.runs.settings import RunSettings, check, pick_device
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import check_file, remove, replaced
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.building import build, build_algorithm, build_env
+from hdrqn_torchrl.runs.settings.run_settings import RunSettings, check, pick_device
 
 if TYPE_CHECKING:
     from torchrl.envs import EnvBase
@@ -110,7 +110,7 @@ def pieces(run: Plan, stop: StopRequest) -> Generator[None, None, float]:
     """:func:`train` in pieces, between which other trainings of this process may have their turns."""
     from torchrl.checkpoint import CheckpointError
 
-    from hdrqn_torchrl.runs.folder import locked
+    from hdrqn_torchrl.runs.persistence.folder import locked
 
     patience = sweeps.PATIENCE_SECONDS if sweeps.is_sweep() else 0.0
     with in_words(run), locked(run.folder, patience_seconds=patience, tell=tell):
@@ -158,9 +158,9 @@ def tell_of_player(sentence: str) -> None:
 
 def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:
     """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
-    from hdrqn_torchrl.runs.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.facts import check_facts, facts_of, write_facts
-    from hdrqn_torchrl.runs.transfer import find_weights, load_weights_of, start_from
+    from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+    from hdrqn_torchrl.runs.persistence.transfer import find_weights, load_weights_of, start_from
 
     for name in layout.WRITTEN:
         check_file(run.folder / name)
@@ -192,8 +192,8 @@ def write_summary(run: Plan, trainer: Trainer, evaluation_env: EnvBase, players:
     """Final greedy evaluation; writes and prints the run's results."""
     from hdrqn_torchrl.analysis.plotting import plot_run
     from hdrqn_torchrl.analysis.results import read_metrics
-    from hdrqn_torchrl.runs import folder
     from hdrqn_torchrl.runs.evaluation import evaluate
+    from hdrqn_torchrl.runs.persistence import folder
 
     result = evaluate(
         evaluation_env,
@@ -225,10 +225,10 @@ def build_run(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvB
     from hdrqn_torchrl.devices import set_deterministic
     from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.envs.specs import interface_differences
-    from hdrqn_torchrl.runs.checkpoint import Checkpoints
-    from hdrqn_torchrl.runs.collecting import make_collector
+    from hdrqn_torchrl.runs.collectors.making import make_collector
     from hdrqn_torchrl.runs.evaluation import evaluate
     from hdrqn_torchrl.runs.logging import RunLogger
+    from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.references import Players
     from hdrqn_torchrl.runs.trainer import Trainer
 

@@ -33,9 +33,9 @@ from pathlib import Path
 
 from hdrqn_torchrl.cli.command_line import check_place, command_line
 from hdrqn_torchrl.cli.marks import put
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.commands import as_called
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.commands import as_called
 
 ACTIONS = ("list", "get", "watch", "add", "page")
 FOLDER = Path(__file__).parents[2] / "zoo"

@@ -18,7 +18,7 @@ from torch.export import Dim, ExportedProgram
 from hdrqn_torchrl import __version__
 from hdrqn_torchrl.export.operations import for_onnx
 from hdrqn_torchrl.export.step import NEXT, DecisionStep, name_of
-from hdrqn_torchrl.runs.files import replaced
+from hdrqn_torchrl.runs.persistence.files import replaced
 
 ENDINGS = (".onnx", ".pt2")
 ABOUT = "hdrqn_torchrl"

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hdrqn_torchrl.runs.agents import Agent, load_agent
-    from hdrqn_torchrl.runs.checkpoint import Checkpoints
-    from hdrqn_torchrl.runs.collectors import ResumableCollector
+    from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
     from hdrqn_torchrl.runs.evaluation import evaluate, play
     from hdrqn_torchrl.runs.logging import RunLogger
+    from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+    from hdrqn_torchrl.runs.persistence.weights import load_policy, load_weights, save_weights
     from hdrqn_torchrl.runs.trainer import Trainer
-    from hdrqn_torchrl.runs.weights import load_policy, load_weights, save_weights
 
 __all__ = [
     "Agent", "Checkpoints", "ResumableCollector", "RunLogger", "Trainer", "evaluate", "load_agent", "load_policy",
@@ -23,16 +23,16 @@ __all__ = [
 ]  # fmt: skip
 _MODULES = {
     "Agent": "agents",
-    "Checkpoints": "checkpoint",
-    "ResumableCollector": "collectors",
+    "Checkpoints": "persistence.checkpoint",
+    "ResumableCollector": "collectors.resumable",
     "RunLogger": "logging",
     "Trainer": "trainer",
     "evaluate": "evaluation",
     "load_agent": "agents",
-    "load_policy": "weights",
-    "load_weights": "weights",
+    "load_policy": "persistence.weights",
+    "load_weights": "persistence.weights",
     "play": "evaluation",
-    "save_weights": "weights",
+    "save_weights": "persistence.weights",
 }
 
 

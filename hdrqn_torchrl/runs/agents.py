@@ -11,13 +11,13 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.envs.specs import interface_differences
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import SettingsError, shown
-from hdrqn_torchrl.runs.building import build_algorithm, build_env
 from hdrqn_torchrl.runs.facts import warn_of_other_names
-from hdrqn_torchrl.runs.reading import read_config
-from hdrqn_torchrl.runs.settings import RunSettings
-from hdrqn_torchrl.runs.weights import load_policy
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.weights import load_policy
+from hdrqn_torchrl.runs.settings.arguments import SettingsError, shown
+from hdrqn_torchrl.runs.settings.building import build_algorithm, build_env
+from hdrqn_torchrl.runs.settings.reading import read_config
+from hdrqn_torchrl.runs.settings.run_settings import RunSettings
 
 
 @dataclass(frozen=True)

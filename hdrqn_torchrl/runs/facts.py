@@ -12,9 +12,9 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.envs.specs import interface
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.arguments import shown
-from hdrqn_torchrl.runs.files import read_json, write_whole
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import read_json, write_whole
+from hdrqn_torchrl.runs.settings.arguments import shown
 
 Facts = dict[str, Any]
 

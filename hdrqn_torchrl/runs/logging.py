@@ -14,8 +14,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from torchrl.record.loggers.common import Logger
 
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.files import open_file, read_bytes, read_text, replaced
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import open_file, read_bytes, read_text, replaced
 from hdrqn_torchrl.runs.services import make_mlflow_logger, make_tensorboard_logger, make_wandb_logger
 
 __all__ = ["CSVLog", "RunLogger", "make_mlflow_logger", "make_tensorboard_logger", "make_wandb_logger"]

@@ -16,10 +16,10 @@ from typing import Any
 from torchrl.record.loggers.common import Logger
 from torchrl.record.loggers.tensorboard import TensorboardLogger
 
-from hdrqn_torchrl.runs import layout
-from hdrqn_torchrl.runs.comparing import flat
-from hdrqn_torchrl.runs.files import check_folder, read_json, write_whole
-from hdrqn_torchrl.runs.locking import lock
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import check_folder, read_json, write_whole
+from hdrqn_torchrl.runs.persistence.locking import lock
+from hdrqn_torchrl.runs.settings.comparing import flat
 
 
 class RewindingTensorboardLogger(TensorboardLogger):

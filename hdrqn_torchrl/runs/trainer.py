@@ -18,19 +18,19 @@ from torchrl.collectors import BaseCollector
 from hdrqn_torchrl.algorithms import Algorithm
 from hdrqn_torchrl.learning import Monitor
 from hdrqn_torchrl.learning.finite import NonFiniteError, naming
-from hdrqn_torchrl.runs.captured_collector import CapturedCollector
-from hdrqn_torchrl.runs.checkpoint import Checkpoints, RandomState
 from hdrqn_torchrl.runs.clock import Clock
-from hdrqn_torchrl.runs.components import components_of
+from hdrqn_torchrl.runs.collectors.captured import CapturedCollector
+from hdrqn_torchrl.runs.collectors.workers import WorkersCollector
 from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.incoming import Incoming
 from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.log_interval import LogInterval, check_counters, crossed, warn_of_clipping
 from hdrqn_torchrl.runs.logging import Row, RunLogger
-from hdrqn_torchrl.runs.saving import Saving
-from hdrqn_torchrl.runs.state_checks import rules_of
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints, RandomState
+from hdrqn_torchrl.runs.persistence.components import components_of
+from hdrqn_torchrl.runs.persistence.saving import Saving
+from hdrqn_torchrl.runs.persistence.state_checks import rules_of
 from hdrqn_torchrl.runs.unattained import UnattainedSubgoals
-from hdrqn_torchrl.runs.workers import WorkersCollector
 
 
 class Trainer:
@@ -42,8 +42,8 @@ class Trainer:
     Args:
         algorithm: policy and learners.
         collector: yields batches ``[N, T]`` from the transformed environment. If ``checkpoints`` are given it must
-            keep its state (:class:`~hdrqn_torchrl.runs.collectors.ResumableCollector`,
-            :class:`~hdrqn_torchrl.runs.workers.WorkersCollector`).
+            keep its state (:class:`~hdrqn_torchrl.runs.collectors.resumable.ResumableCollector`,
+            :class:`~hdrqn_torchrl.runs.collectors.workers.WorkersCollector`).
         logger: where log points go.
         evaluate: plays greedy episodes and returns their averages (:func:`~hdrqn_torchrl.runs.evaluation.evaluate`).
         total_frames: environment frames to collect.
@@ -155,7 +155,7 @@ class Trainer:
                 self._incoming.check(batch, self.frames)
             except Exception as error:
                 self.collector.give_up(self.frames)
-                self._saving.save_after(error, self.frames)
+                self._saving.save_after(error, self.frames, given_up=True)
                 raise
             yield batch
 

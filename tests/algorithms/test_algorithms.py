@@ -21,7 +21,7 @@ from hdrqn_torchrl.modules import (
     compact_network,
     paper_network,
 )
-from hdrqn_torchrl.runs.building import build_algorithm
+from hdrqn_torchrl.runs.settings.building import build_algorithm
 
 NETWORKS = {"compact": compact_network(8, (8,)), "paper": paper_network(8)}
 

@@ -16,7 +16,7 @@ from hdrqn_torchrl.algorithms import make_dqn, make_drqn, make_hdqn, make_hdrqn,
 from hdrqn_torchrl.cli.configuration import CONF, plain
 from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.runs.building import build
+from hdrqn_torchrl.runs.settings.building import build
 
 BUILDERS = {
     "dqn": make_dqn,

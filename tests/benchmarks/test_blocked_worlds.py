@@ -13,7 +13,7 @@ from blocked_worlds import Scripted, Settings
 
 from hdrqn_torchrl.envs import FullInformationPlanner, MultiGoalGridEnv
 from hdrqn_torchrl.envs.grid.scripted import UniformRandom
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 
 def figures(monkeypatch, capsys, player):

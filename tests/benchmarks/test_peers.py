@@ -15,7 +15,7 @@ from ours import OurArguments
 from run_folders import CONF
 
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.runs.building import build_algorithm, build_env
+from hdrqn_torchrl.runs.settings.building import build_algorithm, build_env
 
 TASK = "MiniGrid-DoorKey-8x8-v0"
 

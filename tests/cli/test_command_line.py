@@ -7,7 +7,7 @@ import pytest
 from omegaconf import MISSING
 
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.runs.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 
 @dataclass

@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 from run_folders import CONF
 
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.runs.arguments import _taken_by
-from hdrqn_torchrl.runs.building import build_algorithm
-from hdrqn_torchrl.runs.settings import check
+from hdrqn_torchrl.runs.settings.arguments import _taken_by
+from hdrqn_torchrl.runs.settings.building import build_algorithm
+from hdrqn_torchrl.runs.settings.run_settings import check
 
 
 @pytest.mark.parametrize("name", ["drqn", "v1", "v2", "v3"])

@@ -10,8 +10,8 @@ from programs import TINY_HDRQN
 
 from hdrqn_torchrl.cli import evaluate
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.trust import check_targets, imports_of
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.trust import check_targets, imports_of
 
 ARGUMENTS = [
     *(

@@ -10,7 +10,7 @@ from processes import ROOT
 
 from hdrqn_torchrl.cli import entries, plot
 from hdrqn_torchrl.cli.command_line import command_line
-from hdrqn_torchrl.runs import files
+from hdrqn_torchrl.runs.persistence import files
 
 CONFIG = """\
 env: {_target_: hdrqn_torchrl.envs.MultiGoalGridEnv, layout: open, num_envs: 64, num_goals: 2, view: VIEW, max_steps: STEPS, obstacle: stay}

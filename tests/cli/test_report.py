@@ -16,7 +16,7 @@ from hdrqn_torchrl.cli import findings, report
 from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.cli.configuration import CONF
 from hdrqn_torchrl.cli.studies import STUDIES, Job, is_run_of, jobs_of
-from hdrqn_torchrl.runs.comparing import NOT_LEARNED_FROM, flat
+from hdrqn_torchrl.runs.settings.comparing import NOT_LEARNED_FROM, flat
 
 COLUMNS = (
     "frames,episodes,updates,wall_seconds,behaviour/return,behaviour/steps,greedy/return,greedy/success,greedy/steps"

@@ -18,9 +18,9 @@ from run_folders import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
 from hdrqn_torchrl.cli import resuming
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, plan, record, with_groups_of_run
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.layout import holds_run, split
-from hdrqn_torchrl.runs.settings import as_plain, check
+from hdrqn_torchrl.runs.persistence.layout import holds_run, split
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.run_settings import as_plain, check
 
 
 @cache

@@ -11,8 +11,8 @@ from omegaconf import OmegaConf
 from processes import run_script, start_script
 from programs import TINY, TINY_HDRQN
 
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.seeds import check_together, read_seeds
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.seeds import check_together, read_seeds
 
 QUICK = [
     *TINY, "total_frames=640", "log_frames=128", "evaluation.interval_frames=100_000", "checkpoint.interval_frames=256",

@@ -27,10 +27,10 @@ from hdrqn_torchrl.cli import train
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import compact_network
-from hdrqn_torchrl.runs.building import build, build_algorithm
-from hdrqn_torchrl.runs.durable import verify
-from hdrqn_torchrl.runs.folder import locked
 from hdrqn_torchrl.runs.logging import CSVLog
+from hdrqn_torchrl.runs.persistence.durable import verify
+from hdrqn_torchrl.runs.persistence.folder import locked
+from hdrqn_torchrl.runs.settings.building import build, build_algorithm
 
 SUMMARY = (
     "return_mean", "success_rate", "in_order_rate", "steps_mean", "episodes", "frames", "updates", "wall_seconds",

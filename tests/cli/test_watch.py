@@ -15,9 +15,9 @@ from processes import ROOT
 from hdrqn_torchrl.cli import watch
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.rendering import record_episodes, video
-from hdrqn_torchrl.runs.building import build_algorithm
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
-from hdrqn_torchrl.runs.weights import save_weights
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.persistence.weights import save_weights
+from hdrqn_torchrl.runs.settings.building import build_algorithm
 
 SMALL = ["env.max_steps=4", "network.hidden_size=8", "network.widths=[8]"]
 

@@ -8,7 +8,7 @@ from torchrl.checkpoint import Checkpoint
 
 from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
 from hdrqn_torchrl.data.slices import steps_left
-from hdrqn_torchrl.runs.serialization import SafetensorsAdapter
+from hdrqn_torchrl.runs.persistence.serialization import SafetensorsAdapter
 
 SAMPLINGS = ["steps", "episode_starts", "whole_episodes"]
 ALPHA, FLOOR = 0.7, 1e-3

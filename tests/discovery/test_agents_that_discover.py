@@ -13,8 +13,8 @@ from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
 from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.evaluation import evaluate
-from hdrqn_torchrl.runs.transfer import start_from
-from hdrqn_torchrl.runs.weights import load_weights, save_weights
+from hdrqn_torchrl.runs.persistence.transfer import start_from
+from hdrqn_torchrl.runs.persistence.weights import load_weights, save_weights
 
 PRIVILEGED = ("attained", "success")  # all that the small room says besides
 

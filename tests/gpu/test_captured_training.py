@@ -12,7 +12,7 @@ from hdrqn_torchrl.data import Continuity
 from hdrqn_torchrl.devices import Arriving, to_device
 from hdrqn_torchrl.learning.captured import CudaRecording
 from hdrqn_torchrl.modules import RepeatingEpsilonGreedy, paper_network
-from hdrqn_torchrl.runs.captured_collector import CapturedCollector
+from hdrqn_torchrl.runs.collectors.captured import CapturedCollector
 from hdrqn_torchrl.runs.together import take_turns
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

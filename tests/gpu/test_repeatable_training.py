@@ -8,7 +8,7 @@ from captured_trainings import train_whole_and_cut
 from helpers import check_same
 
 from hdrqn_torchrl.devices import WORKSPACE, set_deterministic
-from hdrqn_torchrl.runs.captured_collector import CudaRecording
+from hdrqn_torchrl.runs.collectors.captured import CudaRecording
 
 os.environ.setdefault(WORKSPACE, ":16:8")  # before any test uses the GPU
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")

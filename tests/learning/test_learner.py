@@ -11,7 +11,7 @@ from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.learning import learner as learner_module
 from hdrqn_torchrl.learning.finite import NonFiniteError
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController, paper_network
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 
 
 def make_learner(

@@ -9,9 +9,10 @@ from processes import ROOT
 from run_folders import HOSTILE, changed, write_run
 
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.runs import building, load_agent
-from hdrqn_torchrl.runs.arguments import SettingsError
-from hdrqn_torchrl.runs.building import build_algorithm
+from hdrqn_torchrl.runs import load_agent
+from hdrqn_torchrl.runs.settings import building
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
+from hdrqn_torchrl.runs.settings.building import build_algorithm
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from tensordict import TensorDict
 from torch import nn
 
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.runs.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.interruption import Interrupted
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.persistence.weights import load_policy
 from hdrqn_torchrl.runs.trainer import Trainer, crossed
-from hdrqn_torchrl.runs.weights import load_policy
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Where steps come from: this process, captured graphs, workers here or elsewhere."""

@@ -1,0 +1,91 @@
+"""Weights alone: a policy's, from a run's checkpoints or from a file of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torchrl.checkpoint import CheckpointError
+
+from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.persistence.durable import sync
+from hdrqn_torchrl.runs.persistence.files import replaced
+from hdrqn_torchrl.runs.persistence.serialization import check_tensors
+
+
+def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
+    """Loads a policy's weights from a run.
+
+    Args:
+        policy: built with the settings of the run.
+        directory: the run's folder of checkpoints; if it is not there, the run's weights beside it are loaded.
+        which: ``"best"``, ``"last"``, or the path of a checkpoint or of a file of :func:`save_weights`.
+
+    Raises:
+        ValueError: if there is none, it is damaged, or it does not fit.
+    """
+    alone = directory.with_name(layout.WEIGHTS)
+    if which in ("best", "last") and not directory.exists() and alone.is_file():
+        load_weights(policy, alone)
+        return
+    checkpoints = Checkpoints(directory)
+    try:
+        path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
+        if path is None:
+            raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
+        if path.is_file():
+            load_weights(policy, path)
+        else:
+            checkpoints.load({"policy": policy}, path)
+    except CheckpointError as error:
+        raise ValueError(f"checkpoint can't be loaded: {error}") from error
+
+
+def save_weights(module: nn.Module, path: Path, *, half: bool = False) -> None:
+    """Writes a module's parameters and buffers to ``path``, which is either the whole file or the one before.
+
+    Args:
+        module: whose state is written.
+        path: the file.
+        half: whether numbers of 32 bits are rounded to 16; they are loaded as 32 bits again.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    weights = {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
+    if half:
+        weights = {name: value.half() if value.dtype == torch.float32 else value for name, value in weights.items()}
+    with replaced(path) as partial:
+        save_file(weights, partial)
+    sync(path.parent)
+
+
+def load_weights(module: nn.Module, path: Path) -> None:
+    """Reads what :func:`save_weights` wrote into ``module``.
+
+    Raises:
+        ValueError: if there is no such file, it is of another kind, or it does not fit the module.
+    """
+    try:
+        module.load_state_dict(read_weights(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
+
+
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """What :func:`save_weights` wrote, by name.
+
+    Raises:
+        ValueError: if there is no such file, or it is of another kind.
+    """
+    if not path.is_file():
+        raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
+    try:
+        check_tensors(path)
+        return load_file(path)
+    except (SafetensorError, ValueError) as error:
+        raise ValueError(
+            f"{path} must be a safetensors file, got something else ({error}); see checkpoints/."
+        ) from error

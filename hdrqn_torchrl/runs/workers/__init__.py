@@ -1,8 +1,0 @@
-"""Collection by many workers, in processes of this machine or in a Ray cluster, as exact as by one collector."""
-
-from hdrqn_torchrl.runs.workers.collector import WorkersCollector
-from hdrqn_torchrl.runs.workers.handles import PlaceLost, WorkerError, WorkerLost
-from hdrqn_torchrl.runs.workers.processes import ProcessWorkers
-from hdrqn_torchrl.runs.workers.worker import MakeWorker, Worker
-
-__all__ = ["MakeWorker", "PlaceLost", "ProcessWorkers", "Worker", "WorkerError", "WorkerLost", "WorkersCollector"]
