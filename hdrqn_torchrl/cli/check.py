@@ -4,7 +4,8 @@
     python check.py env=mine --config-dir my_conf allowed_targets=[my_package.MyEnv]
     python check.py env._target_=my_package.MyEnv allowed_targets=[my_package.MyEnv]
 
-Takes the arguments of a training, of which it uses seed, env and network. Four worlds are stepped with random actions.
+Takes the arguments of a training, of which it uses seed, env and network, and algo if it is given: whether that agent
+can be made. Four worlds are stepped with random actions.
 The exit code is 1 if something is wrong that prevents training, else 0. docs/own_tasks.md explains the contract.
 """
 
@@ -36,7 +37,8 @@ def main() -> None:
         return
     try:
         with results_alone():
-            found = check_settings(composed(arguments))
+            agent = any(each.lstrip("+~").startswith(("algo=", "algo.", "variant=")) for each in arguments)
+            found = check_settings(composed(arguments), agent=agent)
     except ValueError as error:  # also of the environment's own parts, such as a critic
         sys.exit(f"error: {error}")
     print("\n".join(found))
@@ -70,14 +72,26 @@ def composed(arguments: list[str]) -> RunSettings:
     return settings
 
 
-def check_settings(settings: RunSettings) -> list[str]:
-    """What an agent sees and does in the environment that the settings describe, then its faults and gaps."""
+def check_settings(settings: RunSettings, *, agent: bool = False) -> list[str]:
+    """What an agent sees and does in the environment that the settings describe, then its faults and gaps.
+
+    Args:
+        settings: of a training.
+        agent: whether the agent that they describe is made, too.
+    """
     from hdrqn_torchrl.envs import check_task  # takes seconds: it loads torch
+    from hdrqn_torchrl.envs.findings import wrong
     from hdrqn_torchrl.runs.facts import facts_of
 
     changes = {"seed": settings.seed, "device": "cpu", "num_envs": WORLDS}
     env = build_env(settings, changes, settings.allowed_targets)
     network = build(settings.network, place="network", allowed=settings.allowed_targets)
     seen = [f"{name}: {value}" for name, value in facts_of(env).items() if value]
-    found = [str(finding) for finding in check_task(env, network_problem=network.observation_problem)]
+    findings = check_task(env, network_problem=network.observation_problem)
+    if agent and not any(each.severity == "wrong" for each in findings):  # of which it would complain as well
+        try:
+            build(settings.algo, env, network, place="algo", allowed=settings.allowed_targets)
+        except ValueError as error:
+            findings.insert(0, wrong(str(error), "no agent can be made"))
+    found = [str(finding) for finding in findings]
     return [*seen, *(found or ["nothing is wrong or missing"])]

@@ -41,8 +41,23 @@ def test_an_environment_of_a_users_configuration_folder_is_checked_wherever_the_
 
 
 def test_a_faulty_environment_gives_exit_code_1(run, monkeypatch):
-    monkeypatch.setattr(check, "check_settings", lambda settings: ["wrong: 'reward' is missing (no agent)"])
+    monkeypatch.setattr(check, "check_settings", lambda *_, **__: ["wrong: 'reward' is missing (no agent)"])
     assert run("env=gridworld") == (1, "wrong: 'reward' is missing (no agent)\n")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["env=gym", "env.id=CartPole-v1", "algo=v3"], "wrong: algo.env must have what make_v3 reads"),
+        (["env=gridworld", "algo=v3", "algo.levels=4"], "wrong: "),
+        (["env=gridworld", "algo=v3"], "nothing is wrong"),
+        (["env=gym", "env.id=CartPole-v1"], "missing: "),
+    ],
+    ids=str,
+)
+def test_an_agent_that_is_named_is_made_too(run, arguments, words):
+    code, told = run(*arguments)
+    assert code == words.startswith("wrong") and f"\n{words}" in told
 
 
 def test_an_observation_that_the_network_can_not_read_gives_exit_code_1(run, monkeypatch):
