@@ -35,6 +35,7 @@ except ImportError:  # Windows
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 POLL_SECONDS = 1.0
+REMEDY = "the same command with resume=auto goes on, with jobs that were not started, too"
 PATIENCE_SECONDS = 120.0
 """How long a job waits for another process in its folder: one of a killed sweep may still be saving itself."""
 JOBS_ON_A_GPU = 4
@@ -207,6 +208,8 @@ def report(ledger: Path) -> None:
         own = " ".join(override for override in note["overrides"] if override not in shared)
         reason = "stopped or killed" if note["state"] == STARTED else note["state"]
         print(f"  {note['folder']} ({own})\n    {reason}", file=sys.stderr)
+    if missing:
+        print(REMEDY, file=sys.stderr)
 
 
 class _Stop:

@@ -71,6 +71,7 @@ def test_the_list_of_failed_jobs_comes_last(parallel):
         f"    SettingsError: {WRONG}; the paper uses 0.99.",
         "  sweep/5-gridworld-hdqn-seed5 (seed=5 algo.gamma=7)",
         f"    SettingsError: {WRONG}; the paper uses 0.99.",
+        sweeps.REMEDY,
     ]
     assert "Traceback" not in done.stderr
 
@@ -264,7 +265,7 @@ class TestCallback:
         lines = [line.strip() for line in capsys.readouterr().err.splitlines()]
         assert lines[1] == f"unfinished: 2 of 3 started jobs in {tmp_path}"
         assert [line.rpartition("/")[2] for line in lines[2:]] == [
-            "job0 (seed=0)", "stopped or killed", "job2 (seed=2)", "stopped or killed",
+            "job0 (seed=0)", "stopped or killed", "job2 (seed=2)", "stopped or killed", sweeps.REMEDY,
         ]  # fmt: skip
 
     def test_a_note_that_was_torn_off_spoils_no_other(self, callback, tmp_path):
