@@ -36,6 +36,20 @@ class Algorithm:
         monitors: what is counted besides the learning, by name.
         levels: entries with the decisions of each level, from level 0 up, for watching.
         task: what the environment states about itself.
+
+    Examples:
+        >>> from torchrl.collectors import Collector
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=2)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> sizes = {"frames_per_batch": 32, "total_frames": 64}
+        >>> collector = Collector(agent.transform(env), agent.policy, **sizes, auto_register_policy_transforms=False)
+        >>> for batch in collector:
+        ...     agent.observe(batch)
+        >>> {name: learner.frames for name, learner in agent.learners.items()}
+        {'sub': 64, 'meta': 64}
     """
 
     policy: TensorDictModuleBase
@@ -151,6 +165,16 @@ def make_recurrent_loss(
 
     Raises:
         ValueError: if ``settings.stored_state`` is set for a network without memory.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> spec = MultiGoalGridEnv(num_envs=2).observation_spec["observation"]
+        >>> network = compact_network(8, (8,)).q_network(spec, num_actions=4)
+        >>> controller = SubController(network, subgoal_key=None, init_key="is_init")
+        >>> loss = make_recurrent_loss(controller, LearnerSettings(slice_len=4, n_step=3), largest_return=2.0)
+        >>> loss.lookahead
+        3
     """
     loss = RecurrentDQNLoss(
         network,

@@ -26,6 +26,14 @@ class LevelView:
         reward_key: what a step paid it; ``None``: the task's own reward.
         choice_names: names of what it chooses among; empty for actions, which a scene names. Those of subgoals that an
             agent finds itself change as it finds some.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> agent = make_hdrqn(MultiGoalGridEnv(num_envs=2), compact_network(8, (8,)))
+        >>> [(level.name, level.choice_key, level.value_key) for level in agent.levels]
+        [('sub', 'action', 'action_value'), ('meta', 'subgoal', 'subgoal_value')]
     """
 
     name: str

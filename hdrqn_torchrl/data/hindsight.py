@@ -64,7 +64,15 @@ def relabel_subgoals(
         what one without hindsight does.
 
     Examples:
-        See :func:`hdrqn_torchrl.algorithms.make_hdrqn` with ``sub_hindsight=True``.
+        >>> from tensordict import TensorDict
+        >>> no, one = torch.zeros(1, 3, 1, dtype=torch.bool), torch.ones(1, 3, dtype=torch.int64)
+        >>> attained = torch.tensor([[[False, False], [True, False], [False, False]]])
+        >>> after = {"attained": attained, "hazard": no, "intrinsic_reward": torch.zeros(1, 3, 1)}
+        >>> after |= {key: no for key in ("done", "terminated", "option_done", "option_terminated")}
+        >>> root = {"subgoal": one, "subgoal_mask": torch.ones_like(attained), "option_init": no}
+        >>> told = relabel_subgoals(TensorDict({**root, "next": after}, [1, 3]), num_subgoals=2)
+        >>> told["subgoal"].tolist(), told["next", "intrinsic_reward"].squeeze(-1).tolist()
+        ([[1, 1, 1], [0, 0, 0]], [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     """
     shift = torch.arange(num_subgoals, device=sample.device).repeat_interleave(len(sample)).view(-1, 1, 1)
     told: TensorDictBase = torch.cat([sample] * num_subgoals)  # type: ignore[assignment]  # [G * B, T]

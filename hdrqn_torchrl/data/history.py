@@ -19,6 +19,14 @@ class OptionHistory:
     Args:
         max_steps: L; a longer option keeps its first L observations, which then can't be used.
         observation_key: what is gathered.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> seen = torch.tensor([[10, 11, 12, 13]])  # by one environment
+        >>> batch = TensorDict({"observation": seen, "next": {"observation": seen + 1}}, [1, 4])
+        >>> started, ended = torch.tensor([[True, False, False, True]]), torch.tensor([[False, False, True, False]])
+        >>> OptionHistory(max_steps=3)(batch, started, ended)
+        tensor([[10, 11, 12, 13]])
     """
 
     def __init__(self, max_steps: int, observation_key: NestedKey = keys.OBSERVATION) -> None:
@@ -82,6 +90,15 @@ def refresh_hidden(
 
     Returns:
         ``sample``, with new states where the option before ended.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork
+        >>> network = QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=4, hidden_size=8, num_conditions=2)
+        >>> rows = TensorDict({"sub_hidden": torch.zeros(1, 2, 8), "history": torch.rand(1, 2, 5, 3)}, [1, 2])
+        >>> rows["history_steps"], rows["history_subgoal"] = torch.tensor([[[0], [4]]]), torch.tensor([[0, 1]])
+        >>> refresh_hidden(SubController(network), 4, rows)["sub_hidden"].any(-1)
+        tensor([[False,  True]])
     """
     steps = sample.get(HISTORY_STEPS).squeeze(-1).flatten()  # [B * T]; 0: the episode starts, the state is zero
     rows = ((steps > 0) & (steps <= max_steps)).nonzero().squeeze(-1)

@@ -247,6 +247,14 @@ class StepSelector:
             this entry is a mere proposal).
         active_subgoal_key: where the environment wrote the subgoal in force.
         traj_key: number of the episode.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> steps = MultiGoalGridEnv(num_envs=2).rollout(5, break_when_any_done=False)
+        >>> steps["collector", "traj_ids"] = torch.arange(2)[:, None].expand(2, 5)
+        >>> stored = StepSelector(root_keys=["observation", "action"], next_keys=["reward"])(steps)
+        >>> sorted(stored.keys()), sorted(stored["next"].keys())
+        (['action', 'collector', 'next', 'observation'], ['done', 'reward', 'terminated', 'truncated'])
     """
 
     def __init__(

@@ -29,7 +29,18 @@ AnySampler = StepSliceSampler | EpisodeStartSampler | PrioritizedSequenceSampler
 
 
 class SequenceBuffer(TensorDictReplayBuffer):
-    """TorchRL's replay buffer for batches of any length: a single step, or more than it can hold."""
+    """TorchRL's replay buffer for batches of any length: a single step, or more than it can hold.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> buffer = make_sequence_buffer(16, slice_len=4, batch_size=3, num_envs=2)
+        >>> buffer.can_sample()
+        False
+        >>> steps = {"observation": torch.zeros(2, 5, 7), "collector": {"traj_ids": torch.tensor([[0] * 5, [1] * 5])}}
+        >>> _ = buffer.extend(TensorDict(steps, [2, 5]))
+        >>> buffer.can_sample(), len(buffer), buffer.is_full()
+        (True, 10, False)
+    """
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
         """Stores transitions ``[N, T]`` or ``[M]``; the newest, if they are too many.
@@ -235,5 +246,13 @@ def sample_sequences(buffer: TensorDictReplayBuffer, slice_len: int) -> TensorDi
     Args:
         buffer: where to draw.
         slice_len: transitions of its sequences, its lookahead included.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> buffer = make_sequence_buffer(16, slice_len=4, batch_size=3, num_envs=2)
+        >>> steps = {"observation": torch.zeros(2, 5, 7), "collector": {"traj_ids": torch.tensor([[0] * 5, [1] * 5])}}
+        >>> _ = buffer.extend(TensorDict(steps, [2, 5]))
+        >>> sample_sequences(buffer, 4)["observation"].shape
+        torch.Size([3, 4, 7])
     """
     return buffer.sample().reshape(-1, slice_len)

@@ -125,6 +125,18 @@ class EpisodeSliceSampler(StepSliceSampler):
         lookahead: how many of them, at its end, do not influence where it begins; they are padding where the episode is
             over. So an episode's last steps are shown before these as well.
         traj_key, terminated_key: as in :class:`StepSliceSampler`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> sampler = EpisodeSliceSampler(slice_len=3, traj_key="episode")
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=6)
+        >>> steps = {"episode": torch.zeros(5, dtype=torch.int64), "step": torch.arange(5)}
+        >>> _ = buffer.extend(TensorDict(steps, [5]))
+        >>> sample = buffer.sample().reshape(2, 3)
+        >>> sample["step"] - sample["step"][:, :1]  # always whole, as the episode is long enough
+        tensor([[0, 1, 2],
+                [0, 1, 2]])
     """
 
     def __init__(
@@ -167,6 +179,17 @@ class WholeEpisodeSampler(StepSliceSampler):
         slice_len: steps of a slice; an episode's later steps are never shown.
         init_key: first step of an episode.
         traj_key, terminated_key: as in :class:`StepSliceSampler`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> sampler = WholeEpisodeSampler(slice_len=4, traj_key="episode")
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(10), sampler=sampler, batch_size=8)
+        >>> steps = {"episode": torch.tensor([0, 0, 0]), "is_init": torch.tensor([True, False, False])}
+        >>> _ = buffer.extend(TensorDict(steps, [3]))
+        >>> buffer.sample().reshape(2, 4)["collector", "mask"]
+        tensor([[ True,  True,  True, False],
+                [ True,  True,  True, False]])
     """
 
     def __init__(
@@ -213,6 +236,19 @@ class EpisodeStartSampler(SliceSampler):
         init_key: first step of an episode.
         traj_key: entry that numbers the episodes.
         done_key: last step of an episode.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> sampler = EpisodeStartSampler(slice_len=4, traj_key="episode")
+        >>> buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(20, ndim=2), sampler=sampler, batch_size=8)
+        >>> episode = torch.tensor([[0, 0, 0, 1, 1]])  # of one environment
+        >>> init = torch.tensor([[True, False, False, True, False]]).unsqueeze(-1)
+        >>> steps = {"episode": episode, "is_init": init, "next": {"done": init.roll(-1, 1)}}
+        >>> _ = buffer.extend(TensorDict(steps, [1, 5]))
+        >>> buffer.sample().reshape(2, 4)["episode"]  # too few steps follow the start of the second one
+        tensor([[0, 0, 0, 1],
+                [0, 0, 0, 1]])
     """
 
     def __init__(

@@ -253,6 +253,12 @@ def make_change_detector(
         observation: spec of the observation ``[N, ...]``.
         num_actions: A.
         num_tokens, warmup_frames: see :class:`ChangeDetector`.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> detector = make_change_detector(MultiGoalGridEnv(num_envs=2).observation_spec["observation"], num_actions=4)
+        >>> detector.layout, detector.ready
+        (Layout(places=25, planes=(5,)), False)
     """
     shape, sizes = observation.shape[1:], sizes_of(observation)
     if not Layout.of(sizes).places:

@@ -47,6 +47,13 @@ class EventCritic(nn.Module):
     Args:
         detector: tells the events of a step.
         table: which subgoal each is.
+
+    Examples:
+        >>> from hdrqn_torchrl.discovery import ChangeDetector
+        >>> critic = EventCritic(ChangeDetector((5,) * 9, num_actions=4, num_dims=2), SubgoalTable(2))
+        >>> kept = critic.table.assign({116: 1})
+        >>> list(critic.names)
+        ['explore', '(1, 1): 3 -> 0', 'free 2']
     """
 
     detector: Any
@@ -108,7 +115,14 @@ class DiscoveredSubgoals(Transform):
         critic: what events are, and which of them are subgoals. It is not a part of this module.
 
     Examples:
-        See :func:`~hdrqn_torchrl.algorithms.make_v3`, which builds one.
+        >>> from torchrl.envs import TransformedEnv
+        >>> from hdrqn_torchrl.discovery import DiscoverySettings
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> env = MultiGoalGridEnv(num_envs=2)
+        >>> critic, _ = DiscoverySettings(max_subgoals=2).make(env.observation_spec["observation"], num_actions=4)
+        >>> TransformedEnv(env, DiscoveredSubgoals(critic)).reset()["available"]  # "explore", as it has found none yet
+        tensor([[ True, False, False],
+                [ True, False, False]])
     """
 
     def __init__(self, critic: EventCritic) -> None:

@@ -46,6 +46,16 @@ class EventSelection:
 
     Raises:
         ValueError: if a number breaks its rule.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> selection = EventSelection(ChangeDetector((5,) * 9, num_actions=4, num_dims=2), max_subgoals=2)
+        >>> events, reward, done = torch.zeros(1, 8, 5).long(), torch.zeros(1, 8, 1), torch.zeros(1, 8, 1).bool()
+        >>> events[:, ::2, 0], reward[:, ::2] = 116, 1.0
+        >>> after = {"events": events, "extrinsic_reward": reward, "done": done}
+        >>> selection.observe(TensorDict({"action": torch.zeros(1, 8).long(), "next": after}, [1, 8]))
+        >>> selection.update()
+        Chosen(slots={116: 1}, once=[])
     """
 
     def __init__(self, detector: ChangeDetector, *, max_subgoals: int = 8, least: int = 3, deeds: bool = True) -> None:

@@ -35,6 +35,16 @@ class Discovery:
         steps: learns from steps, whose memory is relabelled.
         settings: when.
         options: learners whose memories hold options.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_v3
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> settings = DiscoverySettings(max_subgoals=2)
+        >>> env = MultiGoalGridEnv(num_envs=2)
+        >>> agent = make_v3(env, compact_network(8, (8,)), subgoals="discovered", discovery=settings)
+        >>> agent.monitors["discovery"].metrics()
+        {'discovery/subgoals': 0, 'discovery/found_1': 0, 'discovery/found_2': 0}
     """
 
     def __init__(

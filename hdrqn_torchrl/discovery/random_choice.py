@@ -29,6 +29,16 @@ class RandomSelection:
 
     Raises:
         ValueError: if a number breaks its rule.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> selection = RandomSelection(num_tokens=5, number=2)
+        >>> events, no = torch.zeros(1, 8, 5).long(), torch.zeros(1, 8, 1)
+        >>> events[:, ::2, 0] = 116
+        >>> after = {"events": events, "extrinsic_reward": no, "done": no.bool()}
+        >>> selection.observe(TensorDict({"action": torch.zeros(1, 8).long(), "next": after}, [1, 8]))
+        >>> selection.update()
+        Chosen(slots={116: 1}, once=[])
     """
 
     def __init__(self, num_tokens: int, *, number: int = 8, least: int = 3) -> None:

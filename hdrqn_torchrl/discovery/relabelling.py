@@ -22,6 +22,17 @@ def relabel(steps: TensorDictBase, table: SubgoalTable, *, newest: int, kept: Te
         table: which subgoal each event is.
         newest: row that was written last.
         kept: subgoals that mean what they meant when the steps were last labelled, ``[G]`` bool.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> flags, begins = torch.zeros(4, 1, 2).bool(), torch.tensor([[[True]], [[False]], [[False]], [[False]]])
+        >>> after = {"events": torch.tensor([0, 7, 0, 7]).view(4, 1, 1), "attained": flags.clone()}
+        >>> root = {"collector": {"traj_ids": torch.zeros(4, 1)}, "is_init": begins, "subgoal_mask": ~flags}
+        >>> steps, table = TensorDict({**root, "next": after}, [4, 1]), SubgoalTable(1)
+        >>> kept = table.assign({7: 1})
+        >>> relabel(steps, table, newest=3, kept=kept)
+        >>> steps["next", "attained"][..., 1].flatten()
+        tensor([False,  True, False,  True])
     """
     order = (torch.arange(len(steps), device=steps.device) + newest + 1) % len(steps)  # oldest first
     after, episode = steps.get("next"), steps.get(keys.TRAJ_IDS)[order]

@@ -34,6 +34,13 @@ class DiscoverySettings:
 
     Raises:
         ValueError: if a value breaks its rule.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> spec = MultiGoalGridEnv(num_envs=2).observation_spec["observation"]
+        >>> critic, selection = DiscoverySettings(max_subgoals=4).make(spec, num_actions=4)
+        >>> list(critic.names)
+        ['explore', 'free 1', 'free 2', 'free 3', 'free 4']
     """
 
     max_subgoals: int = 8

@@ -52,6 +52,16 @@ def agreement_with(
         env: environment ``[N]`` with the agent's transforms.
         seed: of the worlds.
         max_steps: steps after which an episode is cut off; ``None``: as the task has it.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_drqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=2, max_steps=5)
+        >>> agent = make_drqn(env, compact_network(8, (8,)))
+        >>> step = DecisionStep(agent, agent.transform(env))
+        >>> agreement_with(step, step, agent.transform(env)).other_actions  # or what load_step returns, then step
+        0
     """
     policy = step.policy
     longest = max_steps or task_of(env).max_steps or LONGEST_EPISODE

@@ -59,6 +59,18 @@ def export_step(step: DecisionStep, path: Path) -> None:
 
     Raises:
         ValueError: see :func:`check_file`.
+
+    Examples:
+        >>> import tempfile
+        >>> from hdrqn_torchrl.algorithms import make_drqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=2)
+        >>> agent = make_drqn(env, compact_network(8, (8,)))
+        >>> step, path = DecisionStep(agent, agent.transform(env)), Path(tempfile.mkdtemp()) / "agent.pt2"
+        >>> export_step(step, path)
+        >>> load_step(path)(step.example())["action"].shape
+        torch.Size([2])
     """
     check_file(path)
     example = step.eval().example()
@@ -111,6 +123,19 @@ def load_step(path: Path) -> Decide:
 
     Raises:
         ValueError: see :func:`check_file`.
+
+    Examples:
+        >>> import tempfile
+        >>> from hdrqn_torchrl.algorithms import make_drqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=2)
+        >>> agent = make_drqn(env, compact_network(8, (8,)))
+        >>> step, path = DecisionStep(agent, agent.transform(env)), Path(tempfile.mkdtemp()) / "agent.pt2"
+        >>> export_step(step, path)
+        >>> decide = load_step(path)
+        >>> list(decide(step.example()))
+        ['action', 'action_value', 'next_sub_hidden', 'next_sub_cell']
     """
     check_file(path)
     return _load_program(path) if path.suffix == ".pt2" else _load_onnx(path)

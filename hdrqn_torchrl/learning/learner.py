@@ -55,7 +55,29 @@ class Learner:
             minibatch, by the priorities of that moment.
 
     Examples:
-        See :func:`hdrqn_torchrl.algorithms.make_drqn`, which builds one.
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
+        >>> from hdrqn_torchrl.data import StepSelector
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import CellFeatures, QNetwork, SubController
+        >>> from hdrqn_torchrl.objectives import RecurrentDQNLoss
+        >>> network = QNetwork(CellFeatures(5, num_codes=5), num_actions=4, hidden_size=8)
+        >>> policy = SubController(network, subgoal_key=None, init_key="is_init")
+        >>> learner = Learner(
+        ...     policy,
+        ...     LearnerSettings(slice_len=4, batch_size=8, capacity=1_000, warmup_frames=0),
+        ...     extract=StepSelector(root_keys=["observation", "action", "is_init"], next_keys=["reward"]),
+        ...     loss=RecurrentDQNLoss(policy, lookahead=1),
+        ...     num_envs=2,
+        ... )
+        >>> env = TransformedEnv(MultiGoalGridEnv(num_envs=2), Compose(InitTracker(), policy.make_tensordict_primer()))
+        >>> sizes = {"frames_per_batch": 32, "total_frames": 32}
+        >>> for batch in Collector(env, policy, **sizes, auto_register_policy_transforms=False):
+        ...     learner.store(batch)
+        >>> for _ in range(learner.updates_due()):
+        ...     report = learner.learn()
+        >>> learner.frames, learner.updates, report["loss"].shape
+        (32, 4, torch.Size([]))
     """
 
     def __init__(

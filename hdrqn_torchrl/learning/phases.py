@@ -29,6 +29,10 @@ class PhaseOne:
 
     Raises:
         ValueError: if a value breaks its rule.
+
+    Examples:
+        >>> PhaseOne(success=0.9, max_frames=200_000)
+        PhaseOne(success=0.9, min_options=100, max_frames=200000, window=100)
     """
 
     success: float = 0.8
@@ -55,6 +59,18 @@ class Phases:
 
     Raises:
         ValueError: if an upper level would not choose at random.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> meta_exploration = EpsilonGreedy(1.0, 0.1)
+        >>> phases = Phases(PhaseOne(max_frames=16), 2, [meta_exploration], learners=[])
+        >>> phases.phase, meta_exploration.held
+        (1, True)
+        >>> no, subgoal = torch.zeros(2, 8, 1, dtype=torch.bool), torch.zeros(2, 8, dtype=torch.int64)
+        >>> step = {"active_subgoal": subgoal, "option_done": no, "subgoal_reached": no}
+        >>> phases.observe(TensorDict({"next": step}, [2, 8]))
+        >>> phases.phase, meta_exploration.held
+        (2, False)
     """
 
     def __init__(

@@ -65,6 +65,15 @@ class LearnerSettings:
 
     Raises:
         ValueError: if a value breaks its rule.
+
+    Examples:
+        >>> settings = LearnerSettings(slice_len=8, batch_size=16, n_step=3)
+        >>> settings.lookahead()  # what targets of three rewards need beyond slice_len
+        2
+        >>> LearnerSettings(slice_len=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: slice_len must be >= 1, got 0; use 1 for a feed-forward network.
     """
 
     slice_len: int | None = 8

@@ -40,6 +40,19 @@ class Architecture:
         memory_span: the steps that a new LSTM keeps things for; 0: as PyTorch makes it, which forgets half in a step.
         observation_problem: takes an observation's spec and its shape without the batch dimensions; returns what an
             observation must be and what to do about it, or ``None`` if this one can be read.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> architecture = Architecture(
+        ...     hidden_size=8,
+        ...     observation_features=lambda spec: CellFeatures(spec.shape[-1], spec.n, (16,)),
+        ...     vector_features=lambda size: FullyConnectedFeatures(size, (16,)),
+        ... )
+        >>> env = MultiGoalGridEnv(num_envs=2)
+        >>> network = architecture.q_network(env.observation_spec["observation"], num_actions=4)
+        >>> value, state = network.step(env.reset()["observation"], None, network.initial_state(2))
+        >>> value.shape
+        torch.Size([2, 4])
     """
 
     hidden_size: int
@@ -112,6 +125,13 @@ def paper_network(hidden_size: int = 256, *, gate_features: bool = False, memory
         hidden_size: H, size of the LSTM.
         gate_features: whether the subgoal also scales the features, besides being appended to them.
         memory_span: as in :class:`Architecture`.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> spec = MultiGoalGridEnv(num_envs=2).observation_spec["observation"]
+        >>> network = paper_network().q_network(spec, num_actions=4)
+        >>> network.unroll(spec.zero((3,)), None).shape
+        torch.Size([3, 2, 4])
     """
 
     dense = (256, 256, 256, 256)
@@ -144,6 +164,14 @@ def compact_network(
 
     Raises:
         ValueError: if a size is not positive.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> spec = MultiGoalGridEnv(num_envs=2).observation_spec["observation"]
+        >>> network = compact_network(16, (32,)).q_network(spec, num_actions=4, num_conditions=2)
+        >>> value, (hidden, cell) = network.step(spec.zero(), torch.tensor([0, 1]), network.initial_state(2))
+        >>> value.shape, hidden.shape
+        (torch.Size([2, 4]), torch.Size([2, 16]))
     """
     sizes = check_widths(widths)
 
@@ -180,6 +208,14 @@ def observation_predictor(
 
     Raises:
         ValueError: if the built-in networks can't read the observation, either.
+
+    Examples:
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> spec = MultiGoalGridEnv(num_envs=2).observation_spec["observation"]
+        >>> predictor = observation_predictor(spec, hidden_size=8, num_actions=4, max_steps=3)
+        >>> memory, action = torch.zeros(2, 7, 8), torch.zeros(2, 7, dtype=torch.int64)
+        >>> predictor(memory, action, torch.zeros(2, 7, *spec.shape[1:], dtype=spec.dtype), steps=3).shape
+        torch.Size([2, 4])
     """
     shape = spec.shape[1:]
     kind = observation_kind(spec, shape)

@@ -165,6 +165,11 @@ class FullyConnectedFeatures(Features):
 
     Shapes:
         ``[*, in_features]`` of any dtype (floats, integers, bool) -> ``[*, widths[-1]]``.
+
+    Examples:
+        >>> features = FullyConnectedFeatures(6, (32, 16))
+        >>> features(torch.zeros(3, 5, 6)).shape, features.out_features
+        (torch.Size([3, 5, 16]), 16)
     """
 
     def __init__(self, in_features: int, widths: tuple[int, ...] = (256, 256, 256, 256)) -> None:

@@ -30,6 +30,21 @@ class HierarchicalPolicy(TensorDictModuleBase):
 
     Raises:
         ValueError: if two of them do not fit each other or share an exploration, or there is no state to advance.
+
+    Examples:
+        >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.transforms import SubgoalTransform
+        >>> env, make = MultiGoalGridEnv(num_envs=3), compact_network(8, (8,)).q_network
+        >>> meta = MetaController(make(8, num_actions=2), input_keys=["sub_hidden"])
+        >>> sub = SubController(make(env.observation_spec["observation"], num_actions=4, num_conditions=2))
+        >>> policy = HierarchicalPolicy(meta, sub)
+        >>> primers = [controller.make_tensordict_primer() for controller in policy.controllers]
+        >>> env = TransformedEnv(env, Compose(InitTracker(), SubgoalTransform(num_subgoals=2), *primers))
+        >>> steps = env.rollout(4, policy, break_when_any_done=False)
+        >>> steps["subgoal"].shape, steps["action"].shape
+        (torch.Size([3, 4]), torch.Size([3, 4]))
     """
 
     def __init__(

@@ -16,7 +16,12 @@ State = tuple[Tensor, Tensor]
 
 
 class DuelingHead(nn.Module):
-    """Q = V + A - mean(A), with value and advantage as two linear streams (Wang et al., 2015)."""
+    """Q = V + A - mean(A), with value and advantage as two linear streams (Wang et al., 2015).
+
+    Examples:
+        >>> DuelingHead(8, num_actions=4)(torch.zeros(2, 5, 8)).shape
+        torch.Size([2, 5, 4])
+    """
 
     def __init__(self, in_features: int, num_actions: int) -> None:
         super().__init__()

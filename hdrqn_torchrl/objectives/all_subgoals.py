@@ -90,7 +90,17 @@ class AllSubgoalsLoss(SequenceLoss):
         ValueError: if an argument breaks its rule.
 
     Examples:
-        See :func:`hdrqn_torchrl.algorithms.make_v3`, which builds one.
+        >>> from torchrl.objectives import SoftUpdate
+        >>> from hdrqn_torchrl.algorithms import make_v3
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=3)
+        >>> agent = make_v3(env, compact_network(8, (8,)))
+        >>> loss = AllSubgoalsLoss(agent.policy)
+        >>> updater = SoftUpdate(loss, tau=0.01)  # of the target network: updater.step() after each gradient step
+        >>> report = loss(agent.transform(env).rollout(7, agent.policy, break_when_any_done=False))
+        >>> report["loss"].shape, report["priority"].shape
+        (torch.Size([]), torch.Size([3]))
     """
 
     @dataclass

@@ -32,7 +32,12 @@ def double_q_value(online: Tensor, target: Tensor, mask: Tensor | None = None) -
 
 
 def greedy_choice(value: Tensor, mask: Tensor | None = None) -> Tensor:
-    """The best action ``[*]`` by Q-values ``[*, A]`` among those that exist (``mask``, ``[*, A]`` bool)."""
+    """The best action ``[*]`` by Q-values ``[*, A]`` among those that exist (``mask``, ``[*, A]`` bool).
+
+    Examples:
+        >>> greedy_choice(torch.tensor([[1.0, 3.0, 2.0]]), torch.tensor([[True, False, True]]))
+        tensor([2])
+    """
     return (value if mask is None else mask_values(value, mask)).argmax(-1)
 
 
@@ -100,6 +105,13 @@ def check_returns(trace_decay: float, n_step: int) -> None:
 
     Raises:
         ValueError: if a value breaks its rule.
+
+    Examples:
+        >>> check_returns(trace_decay=0.8, n_step=1)
+        >>> check_returns(trace_decay=0.0, n_step=0)
+        Traceback (most recent call last):
+        ...
+        ValueError: n_step must be >= 1, got 0; 1 is the one-step target.
     """
     if not 0.0 <= trace_decay <= 1.0:
         raise ValueError(f"trace_decay must lie in [0, 1], got {trace_decay}; use 0.8, or 0 for one-step targets.")
@@ -207,6 +219,10 @@ def importance_weight(weight: Tensor) -> Tensor:
 
     Returns:
         ``[B]``.
+
+    Examples:
+        >>> importance_weight(torch.tensor([[0.5, 0.5, 0.5], [2.0, 2.0, 2.0]]))
+        tensor([0.2500, 1.0000])
     """
     return weight[:, 0] / weight[:, 0].max()
 

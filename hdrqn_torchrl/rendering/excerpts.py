@@ -16,6 +16,17 @@ def excerpt(frames: Sequence[Frame], most: int) -> list[Frame]:
     Args:
         frames: what :func:`~hdrqn_torchrl.rendering.record_episodes` returned, at least one.
         most: number of frames that there is room for.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.rendering import record_episodes
+        >>> env = MultiGoalGridEnv(num_envs=1, max_steps=3)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> frames = record_episodes(agent.transform(env), agent, episodes=3)
+        >>> len(frames), len(excerpt(frames, most=10))
+        (12, 8)
     """
     ends = [place + 1 for place, frame in enumerate(frames) if frame.outcome] or [len(frames)]
     fitting = [end for end in ends if end <= most]

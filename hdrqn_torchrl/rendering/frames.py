@@ -88,6 +88,19 @@ class Frame:
         event: what the step before did; empty if nothing of note.
         outcome: how the episode ended; empty while it is played.
         success: whether it ended with the whole task completed.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.rendering import record_episodes
+        >>> env = MultiGoalGridEnv(num_envs=1, max_steps=3)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> first, *_, last = record_episodes(agent.transform(env), agent)
+        >>> first.pursuits[0].names, first.starts_option, len(first.action.values)
+        (('goal 1', 'goal 2'), True, 4)
+        >>> last.score.steps, last.outcome
+        (3, 'time is up')
     """
 
     scene: Scene

@@ -30,6 +30,17 @@ def draw_frame(frame: Frame, spans: BarSpans = BarSpans()) -> NDArray[np.uint8]:
 
     Returns:
         ``[456, 760, 3]`` uint8 RGB.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.rendering import bar_spans, record_episodes
+        >>> env = MultiGoalGridEnv(num_envs=1, max_steps=3)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> frames = record_episodes(agent.transform(env), agent)
+        >>> draw_frame(frames[0], bar_spans(frames)).shape
+        (456, 760, 3)
     """
     image = Image.new("RGB", (WIDTH, HEIGHT), _PAPER)
     draw = ImageDraw.Draw(image)

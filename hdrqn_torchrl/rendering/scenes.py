@@ -75,6 +75,13 @@ class PlainScene:
         rendered: a picture ``[height, width, 3]`` uint8, a string, or nothing.
         observation: what the agent sees.
         parts: names and sizes of the entries that a vector is joined from, if it is.
+
+    Examples:
+        >>> scene = PlainScene(("left", "right"), (), rendered=None, observation=np.array([0.5, -1.0]))
+        >>> scene.write_view().plain
+        '[ 0.5 -1. ]'
+        >>> scene.draw_world(330).size
+        (330, 330)
     """
 
     action_names: tuple[str, ...]

@@ -47,6 +47,17 @@ def subgoal_records(frames: Sequence[Frame]) -> list[SubgoalRecord]:
 
     Raises:
         ValueError: if the agent has none.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.rendering import record_episodes
+        >>> env = MultiGoalGridEnv(num_envs=1, max_steps=3)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> records = subgoal_records(record_episodes(agent.transform(env), agent, episodes=2))
+        >>> [record.name for record in records]
+        ['goal 1', 'goal 2']
     """
     if not frames or not frames[0].pursuits:
         raise ValueError("frames must be those of an agent that pursues subgoals, got others; a flat agent has none.")
@@ -95,6 +106,11 @@ def draw_sheet(
 
     Returns:
         ``[height, width, 3]`` uint8 RGB.
+
+    Examples:
+        >>> records = [SubgoalRecord("key", 0.5, options=4, reached=0.25, value=0.8, moments=())]
+        >>> draw_sheet(records, moments=2).shape
+        (160, 790, 3)
     """
     rows = [(place, each) for place, each in enumerate(records) if each.moments or each.options]
     width, height = 2 * _MARGIN + _TEXT + moments * _MOMENT, 2 * _MARGIN + _ROW * max(1, len(rows))

@@ -23,6 +23,19 @@ def draw_text(frame: Frame, spans: BarSpans = BarSpans()) -> RenderableType:  # 
     Args:
         frame: from :func:`~hdrqn_torchrl.rendering.record_episodes`.
         spans: scales of the bars (:func:`~hdrqn_torchrl.rendering.bar_spans`).
+
+    Examples:
+        >>> from rich.console import Console
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.rendering import record_episodes
+        >>> env = MultiGoalGridEnv(num_envs=1, max_steps=3)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> frames = record_episodes(agent.transform(env), agent)
+        >>> Console().print(draw_text(frames[0]))
+        episode 1 of 1   step 0 of 3   rᵉˣ 0.00   rⁱⁿ 0.00, this option 0.00
+        ...
     """
     scenes = Table.grid(padding=(0, 3))
     scenes.add_row(_heading("world"), _heading("sees"))

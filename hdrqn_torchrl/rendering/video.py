@@ -54,6 +54,19 @@ def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4, width: int
 
     Raises:
         ValueError: see :func:`check_video`.
+
+    Examples:
+        >>> import tempfile
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.rendering import record_episodes
+        >>> env = MultiGoalGridEnv(num_envs=1, max_steps=3)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> path = Path(tempfile.mkdtemp()) / "episode.gif"
+        >>> write_video(record_episodes(agent.transform(env), agent), path, width=400)
+        >>> path.read_bytes()[:6]
+        b'GIF89a'
     """
     check_video(path, fps=fps)
     if not frames:

@@ -109,6 +109,16 @@ def play(
     Raises:
         ValueError: if ``max_steps`` is below 1, or if without it an episode does not end: after as many steps as the
             task states or, if it states none, :data:`LONGEST_EPISODE`, or :data:`PATIENCE` if none ends at all.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=4, max_steps=10)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> played = play(agent.transform(env), agent.policy, episodes=8)
+        >>> played["return"].shape, played["reached"].shape
+        (torch.Size([8]), torch.Size([8, 2]))
     """
     if max_steps is not None and max_steps < 1:
         raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None plays episodes to their end.")
@@ -146,6 +156,15 @@ def evaluate(
         ``return_mean``, ``steps_mean``, ``episodes`` and, as far as environment and agent have them,
         ``extrinsic_mean``, ``intrinsic_mean``, ``success_rate`` (share of episodes that complete the whole task),
         ``in_order_rate`` (share of subgoals reached in the proper order), ``cut_off_rate``.
+
+    Examples:
+        >>> from hdrqn_torchrl.algorithms import make_hdrqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> env = MultiGoalGridEnv(num_envs=4, max_steps=10)
+        >>> agent = make_hdrqn(env, compact_network(8, (8,)))
+        >>> list(evaluate(agent.transform(env), agent.policy, episodes=4))
+        ['return_mean', 'extrinsic_mean', 'intrinsic_mean', 'success_rate', 'in_order_rate', 'steps_mean', 'episodes']
     """
     played = play(env, policy, episodes=episodes, seed=seed, exploration_type=exploration_type, max_steps=max_steps)
     return {**{name: _mean(values) for name, values in columns(played).items()}, "episodes": len(played)}

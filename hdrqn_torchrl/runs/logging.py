@@ -112,6 +112,15 @@ class RunLogger:
             of the log points in between if there was none for a minute.
         label: put before those lines, to tell the runs of a sweep apart.
         bar: whether a terminal shows a bar.
+
+    Examples:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> logger = RunLogger(folder, total_frames=100)
+        >>> logger.log({"frames": 50, "sub/loss": 0.5})
+        >>> logger.close()
+        >>> (folder / "metrics.csv").read_text().split()
+        ['frames,sub/loss', '50,0.5']
     """
 
     def __init__(

@@ -55,6 +55,28 @@ class Trainer:
         ceiling: asked at every greedy evaluation for the return of a scripted player, which is logged next to the
             agent's; ``None`` if there is none.
         stop: asked for at safe points; several trainings of a process share one.
+
+    Examples:
+        >>> import tempfile
+        >>> from torchrl.collectors import Collector
+        >>> from hdrqn_torchrl.algorithms import make_drqn
+        >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
+        >>> from hdrqn_torchrl.modules import compact_network
+        >>> from hdrqn_torchrl.runs import evaluate
+        >>> env, judge = MultiGoalGridEnv(num_envs=2), MultiGoalGridEnv(num_envs=4, max_steps=10)
+        >>> agent = make_drqn(env, compact_network(8, (8,)))
+        >>> env, judge = agent.transform(env), agent.transform(judge)
+        >>> sizes = {"frames_per_batch": 32, "total_frames": -1}
+        >>> trainer = Trainer(
+        ...     agent,
+        ...     Collector(env, agent.policy, **sizes, auto_register_policy_transforms=False),
+        ...     logger=RunLogger(Path(tempfile.mkdtemp()), total_frames=64),
+        ...     evaluate=lambda: evaluate(judge, agent.policy, episodes=4),
+        ...     total_frames=64,
+        ... )
+        >>> trainer.train()
+        >>> trainer.frames, trainer.updates  # no update before LearnerSettings.warmup_frames
+        (64, 0)
     """
 
     def __init__(

@@ -275,6 +275,13 @@ def advance_option(
 
     Returns:
         ``steps`` and ``collected`` after the step.
+
+    Examples:
+        >>> steps, collected = torch.tensor([[2], [7]]), torch.tensor([[1.0], [9.0]])
+        >>> first = torch.tensor([[False], [True]])
+        >>> steps, collected = advance_option(first, steps, collected, torch.ones(2, 1), gamma=0.5)
+        >>> steps.tolist(), collected.tolist()
+        ([[3], [1]], [[1.25], [1.0]])
     """
     steps = steps.masked_fill(init, 0)
     return steps + 1, collected.masked_fill(init, 0.0) + gamma**steps * reward

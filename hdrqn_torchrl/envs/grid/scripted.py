@@ -61,6 +61,11 @@ class UniformRandom:
     Args:
         env: the environment it plays.
         seed: seed of its own random numbers.
+
+    Examples:
+        >>> env = MultiGoalGridEnv(num_envs=8, seed=0)
+        >>> env.rollout(50, UniformRandom(env, seed=0), break_when_any_done=False)["action"].shape
+        torch.Size([8, 50])
     """
 
     def __init__(self, env: MultiGoalGridEnv, seed: int = 0) -> None:
@@ -94,6 +99,12 @@ def play_episodes(env: MultiGoalGridEnv, player: Player, *, seconds: float | Non
 
     Raises:
         TimeoutError: if the time is up.
+
+    Examples:
+        >>> env = MultiGoalGridEnv(num_envs=8, seed=0)
+        >>> played = play_episodes(env, FullInformationPlanner(env))
+        >>> played["success_rate"], played["episodes"]
+        (1.0, 8)
     """
     played = _play(env, player, _deadline(seconds))
     return _summary([played])

@@ -27,6 +27,14 @@ def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None
 
     Raises:
         ValueError: if there is none, it is damaged, or it does not fit.
+
+    Examples:
+        >>> import tempfile
+        >>> trained, policy, run = nn.Linear(2, 1), nn.Linear(2, 1), Path(tempfile.mkdtemp())
+        >>> save_weights(trained, run / "weights.safetensors")
+        >>> load_policy(policy, run / "checkpoints")
+        >>> torch.equal(policy.weight, trained.weight)
+        True
     """
     alone = directory.with_name(layout.WEIGHTS)
     if which in ("best", "last") and not directory.exists() and alone.is_file():
@@ -52,6 +60,14 @@ def save_weights(module: nn.Module, path: Path, *, half: bool = False) -> None:
         module: whose state is written.
         path: the file.
         half: whether numbers of 32 bits are rounded to 16; they are loaded as 32 bits again.
+
+    Examples:
+        >>> import tempfile
+        >>> from safetensors.torch import load_file
+        >>> path = Path(tempfile.mkdtemp()) / "weights.safetensors"
+        >>> save_weights(nn.Linear(2, 1), path, half=True)
+        >>> load_file(path)["weight"].dtype
+        torch.float16
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     weights = {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
@@ -67,6 +83,15 @@ def load_weights(module: nn.Module, path: Path) -> None:
 
     Raises:
         ValueError: if there is no such file, it is of another kind, or it does not fit the module.
+
+    Examples:
+        >>> import tempfile
+        >>> trained, other = nn.Linear(2, 1), nn.Linear(2, 1)
+        >>> path = Path(tempfile.mkdtemp()) / "weights.safetensors"
+        >>> save_weights(trained, path)
+        >>> load_weights(other, path)
+        >>> torch.equal(other.weight, trained.weight)
+        True
     """
     try:
         module.load_state_dict(read_weights(path))
