@@ -11,6 +11,7 @@ from torchrl.data import SliceSampler, Storage
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.data.slices import episode_starts, padded_slices, steps_left, steps_passed
+from hdrqn_torchrl.modules.sizes import check_size
 
 
 class StepSliceSampler(SliceSampler):
@@ -40,6 +41,7 @@ class StepSliceSampler(SliceSampler):
     def __init__(
         self, *, slice_len: int, traj_key: NestedKey = keys.TRAJ_IDS, terminated_key: NestedKey | None = None
     ) -> None:
+        check_size("slice_len", slice_len, 8)
         super().__init__(
             slice_len=slice_len,
             traj_key=traj_key,
@@ -148,6 +150,8 @@ class EpisodeSliceSampler(StepSliceSampler):
         terminated_key: NestedKey | None = None,
     ) -> None:
         super().__init__(slice_len=slice_len, traj_key=traj_key, terminated_key=terminated_key)
+        if not 0 <= lookahead < slice_len:
+            raise ValueError(f"lookahead must lie in [0, slice_len={slice_len}), got {lookahead}; 0 is none.")
         self.lookahead = lookahead
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[tuple[Tensor, ...], dict[NestedKey, Any]]:
@@ -259,6 +263,7 @@ class EpisodeStartSampler(SliceSampler):
         traj_key: NestedKey = keys.TRAJ_IDS,
         done_key: NestedKey = ("next", keys.DONE),
     ) -> None:
+        check_size("slice_len", slice_len, 8)
         super().__init__(slice_len=slice_len, traj_key=traj_key, truncated_key=None, init_key=None, cache_values=True)
         self.first_key, self.done_key = init_key, done_key
 

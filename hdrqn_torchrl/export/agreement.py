@@ -14,6 +14,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.export.step import NEXT, DecisionStep, name_of
 from hdrqn_torchrl.modules import writing_values
+from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.runs.evaluation import LONGEST_EPISODE
 from hdrqn_torchrl.runs.isolation import isolated
 
@@ -63,6 +64,8 @@ def agreement_with(
         >>> agreement_with(step, step, agent.transform(env)).other_actions  # or what load_step returns, then step
         0
     """
+    if max_steps is not None:
+        check_size("max_steps", max_steps, "None for whole episodes")
     policy = step.policy
     longest = max_steps or task_of(env).max_steps or LONGEST_EPISODE
     example = step.example()

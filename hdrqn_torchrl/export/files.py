@@ -47,7 +47,7 @@ def check_file(path: Path) -> None:
         )
 
 
-def export_step(step: DecisionStep, path: Path) -> None:
+def export_step(step: DecisionStep, path: str | Path) -> None:
     """Writes a decision to a file, which is either whole or the one before.
 
     The first dimension of all inputs may have any size. Names of subgoals and of the parts of the state are in the
@@ -72,6 +72,7 @@ def export_step(step: DecisionStep, path: Path) -> None:
         >>> load_step(path)(step.example())["action"].shape
         torch.Size([2])
     """
+    path = Path(path)
     check_file(path)
     example = step.eval().example()
     batch = Dim("batch")
@@ -115,7 +116,7 @@ def describe(step: DecisionStep) -> dict[str, Any]:
     }
 
 
-def load_step(path: Path) -> Decide:
+def load_step(path: str | Path) -> Decide:
     """A decision read back from its file, as a function of tensors by name.
 
     Args:
@@ -137,6 +138,7 @@ def load_step(path: Path) -> Decide:
         >>> list(decide(step.example()))
         ['action', 'action_value', 'next_sub_hidden', 'next_sub_cell']
     """
+    path = Path(path)
     check_file(path)
     return _load_program(path) if path.suffix == ".pt2" else _load_onnx(path)
 

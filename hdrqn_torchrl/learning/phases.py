@@ -15,6 +15,7 @@ from hdrqn_torchrl.learning.learner import Learner
 from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
 from hdrqn_torchrl.modules import EpsilonGreedy, SubgoalSuccess
+from hdrqn_torchrl.modules.sizes import check_size
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +46,8 @@ class PhaseOne:
             raise ValueError(f"success must lie in (0, 1], got {self.success}; use 0.8.")
         if self.max_frames < 1:
             raise ValueError(f"max_frames must be >= 1, got {self.max_frames}; leave phase_one out to have none.")
+        check_size("min_options", self.min_options, 100)
+        check_size("window", self.window, 100)
 
 
 class Phases:

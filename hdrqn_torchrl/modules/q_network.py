@@ -18,6 +18,13 @@ State = tuple[Tensor, Tensor]
 class DuelingHead(nn.Module):
     """Q = V + A - mean(A), with value and advantage as two linear streams (Wang et al., 2015).
 
+    Args:
+        in_features: D of the features ``[*, D]``.
+        num_actions: A of the Q-values ``[*, A]``.
+
+    Raises:
+        ValueError: if a size is not positive.
+
     Examples:
         >>> DuelingHead(8, num_actions=4)(torch.zeros(2, 5, 8)).shape
         torch.Size([2, 5, 4])
@@ -25,6 +32,8 @@ class DuelingHead(nn.Module):
 
     def __init__(self, in_features: int, num_actions: int) -> None:
         super().__init__()
+        check_size("in_features", in_features, 128)
+        check_size("num_actions", num_actions, 4)
         self.streams = ExactLinear(in_features, 1 + num_actions)
 
     def forward(self, features: Tensor) -> Tensor:

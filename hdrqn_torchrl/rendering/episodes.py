@@ -60,6 +60,8 @@ def record_episodes(
         raise ValueError(f"env must have batch size [1], got {list(env.batch_size)}; build it with num_envs=1.")
     if episodes < 1:
         raise ValueError(f"episodes must be >= 1, got {episodes}; 3 show most of what an agent does.")
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None plays episodes to their end.")
     if not 0.0 <= epsilon <= 1.0:
         raise ValueError(f"epsilon must lie in [0, 1], got {epsilon}; 0 plays greedily.")
     if not algorithm.levels:

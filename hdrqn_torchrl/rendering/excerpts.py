@@ -15,7 +15,7 @@ def excerpt(frames: Sequence[Frame], most: int) -> list[Frame]:
 
     Args:
         frames: what :func:`~hdrqn_torchrl.rendering.record_episodes` returned, at least one.
-        most: number of frames that there is room for.
+        most: number of frames that there is room for; a beginning and an end are there in any case.
 
     Examples:
         >>> from hdrqn_torchrl.algorithms import make_hdrqn

@@ -43,7 +43,7 @@ def check_video(path: Path | None, *, fps: int) -> None:
         raise ValueError(f"fps must lie in [1, 50], got {fps}; use 4 to follow each step.")
 
 
-def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4, width: int = WIDTH) -> None:
+def write_video(frames: Sequence[Frame], path: str | Path, *, fps: int = 4, width: int = WIDTH) -> None:
     """Writes a GIF that loops forever, or an MP4 (H.264), which needs PyAV.
 
     Args:
@@ -68,6 +68,7 @@ def write_video(frames: Sequence[Frame], path: Path, *, fps: int = 4, width: int
         >>> path.read_bytes()[:6]
         b'GIF89a'
     """
+    path = Path(path)
     check_video(path, fps=fps)
     if not frames:
         raise ValueError("frames must hold at least one frame, got none; use record_episodes.")

@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase, ExplorationType
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs import Task, task_of
+from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 from hdrqn_torchrl.runs.isolation import isolated
 
@@ -107,8 +108,9 @@ def play(
         given, ``cut_off`` (1 if it was).
 
     Raises:
-        ValueError: if ``max_steps`` is below 1, or if without it an episode does not end: after as many steps as the
-            task states or, if it states none, :data:`LONGEST_EPISODE`, or :data:`PATIENCE` if none ends at all.
+        ValueError: if ``episodes`` or ``max_steps`` is below 1, or if without it an episode does not end: after as many
+            steps as the task states or, if it states none, :data:`LONGEST_EPISODE`, or :data:`PATIENCE` if none ends at
+            all.
 
     Examples:
         >>> from hdrqn_torchrl.algorithms import make_hdrqn
@@ -120,6 +122,7 @@ def play(
         >>> played["return"].shape, played["reached"].shape
         (torch.Size([8]), torch.Size([8, 2]))
     """
+    check_size("episodes", episodes, 100)
     if max_steps is not None and max_steps < 1:
         raise ValueError(f"max_steps must be >= 1 or None, got {max_steps}; None plays episodes to their end.")
     rounds, task = [], task_of(env)

@@ -105,7 +105,7 @@ class RunLogger:
     """Sends each log point to the CSV file, to TorchRL loggers and to the terminal.
 
     Args:
-        folder: run folder.
+        folder: run folder; it is made if it is not there.
         total_frames: end of the progress bar.
         loggers: any TorchRL loggers (TensorBoard, W&B, ...); scalars are logged under their column's name.
         console: where progress goes; a terminal shows a bar, anything else a line per greedy evaluation, and for one
@@ -125,7 +125,7 @@ class RunLogger:
 
     def __init__(
         self,
-        folder: Path,
+        folder: str | Path,
         *,
         total_frames: int,
         loggers: list[Logger] | None = None,
@@ -134,7 +134,8 @@ class RunLogger:
         bar: bool = True,
     ) -> None:
         self.label = f"{label}  " if label else ""
-        self.csv, self.loggers = CSVLog(folder / layout.METRICS), loggers or []
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        self.csv, self.loggers = CSVLog(Path(folder) / layout.METRICS), loggers or []
         self.console = console or Console(file=sys.stderr)
         self._bar = bar and self.console.is_terminal
         self._progress = Progress(

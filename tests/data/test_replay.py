@@ -5,7 +5,13 @@ import torch
 from streams import Stream, check_sequences, one_episode
 from torchrl.data import SliceSampler
 
-from hdrqn_torchrl.data import make_sequence_buffer, sample_sequences
+from hdrqn_torchrl.data import (
+    EpisodeSliceSampler,
+    StepSliceSampler,
+    WholeEpisodeSampler,
+    make_sequence_buffer,
+    sample_sequences,
+)
 from hdrqn_torchrl.data.slices import episode_starts
 
 PADDED = ["steps", "episodes", "whole_episodes"]
@@ -451,3 +457,16 @@ def test_loading_a_memory_clears_the_caches_of_its_sampler(sampling):
         torch.manual_seed(0)
         drawn.append(sample_sequences(buffer, 4))
     assert (drawn[0] == drawn[1]).all()
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "message"),
+    [
+        (StepSliceSampler, {"slice_len": 0}, "slice_len must be >= 1, got 0"),
+        (WholeEpisodeSampler, {"slice_len": 0}, "slice_len must be >= 1, got 0"),
+        (EpisodeSliceSampler, {"slice_len": 2, "lookahead": 2}, r"lookahead must lie in \[0, slice_len=2\), got 2"),
+    ],
+)
+def test_samplers_refuse_lengths_that_make_no_sense(kind, settings, message):
+    with pytest.raises(ValueError, match=message):
+        kind(**settings)

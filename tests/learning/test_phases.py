@@ -73,7 +73,9 @@ class TestPhases:
         with pytest.raises(ValueError, match=r"meta_exploration\.start must be 1\.0 with phase_one, got 0\.5"):
             Phases(PhaseOne(), 2, [EpsilonGreedy(0.5)], [])
 
-    @pytest.mark.parametrize("settings", [{"success": 0.0}, {"success": 1.1}, {"max_frames": 0}], ids=str)
+    @pytest.mark.parametrize(
+        "settings", [{"success": 0.0}, {"success": 1.1}, {"max_frames": 0}, {"min_options": 0}, {"window": 0}], ids=str
+    )
     def test_settings_out_of_range_are_refused(self, settings):
         (name,) = settings
         with pytest.raises(ValueError, match=f"{name} must .*, got {settings[name]}; "):

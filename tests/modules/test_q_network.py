@@ -131,6 +131,12 @@ def test_the_initial_state_is_zero():
     assert not cell.any()
 
 
+@pytest.mark.parametrize(("sizes", "name"), [((0, 4), "in_features"), ((8, -1), "num_actions")])
+def test_a_head_without_inputs_or_actions_is_refused(sizes, name):
+    with pytest.raises(ValueError, match=f"{name} must be >= 1"):
+        DuelingHead(*sizes)
+
+
 def test_a_wrong_hidden_size_is_refused():
     with pytest.raises(ValueError, match="hidden_size must be >= 1, got 0; "):
         make_network(hidden_size=0)

@@ -209,6 +209,7 @@ class TestWalk:
     ("changes", "message"),
     [
         ({"episodes": 0}, "episodes must be >= 1, got 0"),
+        ({"max_steps": 0}, "max_steps must be >= 1 or None, got 0"),
         ({"epsilon": 1.5}, r"epsilon must lie in \[0, 1\], got 1.5"),
         ({"epsilon": -0.1}, "epsilon must lie"),
     ],

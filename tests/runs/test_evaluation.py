@@ -221,6 +221,8 @@ class TestTasksOfOthers:
         assert evaluate(env, right, episodes=4, max_steps=7)["return_mean"] == 1.0
         with pytest.raises(ValueError, match="max_steps must be >= 1 or None, got 0"):
             evaluate(env, right, episodes=4, max_steps=0)
+        with pytest.raises(ValueError, match="episodes must be >= 1, got 0"):
+            evaluate(env, right, episodes=0)
 
 
 class StepLog:

@@ -77,12 +77,12 @@ class Checkpoints:
         True
     """
 
-    def __init__(self, directory: Path, *, keep_last: int = 2, replay: Replay = True) -> None:
+    def __init__(self, directory: str | Path, *, keep_last: int = 2, replay: Replay = True) -> None:
         if keep_last < 2:
             raise ValueError(f"keep_last must be >= 2, got {keep_last}; one must stay while the newest is replaced.")
         if replay not in (True, False, "last"):
             raise ValueError(f"replay must be True, False or 'last', got {replay!r}; True resumes bit for bit.")
-        self.directory, self.replay = directory, replay
+        self.directory, self.replay = Path(directory), replay
         self._keep_last = keep_last
 
     def save(self, components: Mapping[str, Any], *, step: int, score: float | None = None) -> Path:

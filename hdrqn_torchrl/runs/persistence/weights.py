@@ -17,7 +17,7 @@ from hdrqn_torchrl.runs.persistence.files import replaced
 from hdrqn_torchrl.runs.persistence.serialization import check_tensors
 
 
-def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None:
+def load_policy(policy: nn.Module, directory: str | Path, which: str = "best") -> None:
     """Loads a policy's weights from a run.
 
     Args:
@@ -36,6 +36,7 @@ def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None
         >>> torch.equal(policy.weight, trained.weight)
         True
     """
+    directory = Path(directory)
     alone = directory.with_name(layout.WEIGHTS)
     if which in ("best", "last") and not directory.exists() and alone.is_file():
         load_weights(policy, alone)
@@ -53,7 +54,7 @@ def load_policy(policy: nn.Module, directory: Path, which: str = "best") -> None
         raise ValueError(f"checkpoint can't be loaded: {error}") from error
 
 
-def save_weights(module: nn.Module, path: Path, *, half: bool = False) -> None:
+def save_weights(module: nn.Module, path: str | Path, *, half: bool = False) -> None:
     """Writes a module's parameters and buffers to ``path``, which is either the whole file or the one before.
 
     Args:
@@ -69,6 +70,7 @@ def save_weights(module: nn.Module, path: Path, *, half: bool = False) -> None:
         >>> load_file(path)["weight"].dtype
         torch.float16
     """
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     weights = {name: value.detach().cpu().contiguous().clone() for name, value in module.state_dict().items()}
     if half:
@@ -78,7 +80,7 @@ def save_weights(module: nn.Module, path: Path, *, half: bool = False) -> None:
     sync(path.parent)
 
 
-def load_weights(module: nn.Module, path: Path) -> None:
+def load_weights(module: nn.Module, path: str | Path) -> None:
     """Reads what :func:`save_weights` wrote into ``module``.
 
     Raises:
@@ -99,12 +101,13 @@ def load_weights(module: nn.Module, path: Path) -> None:
         raise ValueError(f"{path} does not fit this policy; build it with the settings of its run.\n{error}") from error
 
 
-def read_weights(path: Path) -> dict[str, Tensor]:
+def read_weights(path: str | Path) -> dict[str, Tensor]:
     """What :func:`save_weights` wrote, by name.
 
     Raises:
         ValueError: if there is no such file, or it is of another kind.
     """
+    path = Path(path)
     if not path.is_file():
         raise ValueError(f"path must name a weights file, got {path}; a run keeps its own in checkpoints/.")
     try:

@@ -23,8 +23,9 @@ def test_a_policy_comes_back_with_its_weights_and_schedules(tmp_path):
     source, copy = build("v2", small_env(2)), build("v2", small_env(2))
     for level in source.explorations.values():
         level.step(12_345)
-    save_weights(source.policy, tmp_path / "checkpoints" / "last.safetensors")
-    load_weights(copy.policy, tmp_path / "checkpoints" / "last.safetensors")
+    path = f"{tmp_path}/checkpoints/last.safetensors"
+    save_weights(source.policy, path)
+    load_weights(copy.policy, path)
     wanted, found = source.policy.state_dict(), copy.policy.state_dict()
     assert wanted.keys() == found.keys() and all((wanted[key] == found[key]).all() for key in wanted)
     assert copy.explorations["sub"].epsilon == source.explorations["sub"].epsilon < 1.0
