@@ -63,7 +63,6 @@ def test_it_waits_until_there_was_time_enough(episodes, share):
         ("drqn", house, {}, []),
         ("v3", small_env, {"subgoals": "discovered"}, []),
     ],
-    ids=str,
 )
 def test_an_agent_is_watched_for_the_subgoals_that_it_was_given(name, worlds, options, pursued):
     env = worlds(4)
