@@ -25,6 +25,7 @@ class UnattainedSubgoals:
         sets: of the subgoals that the agent pursues.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> watch = UnattainedSubgoals([SubgoalSet(names=("key", "door"))])
         >>> step = {"attained": torch.tensor([[[True, False]]]), "done": torch.ones(1, 1, 1, dtype=torch.bool)}
