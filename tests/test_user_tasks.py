@@ -19,7 +19,7 @@ from hdrqn_torchrl.rendering import draw_frame, record_episodes
 TRUSTED = "allowed_targets=[user_envs.Corridor]"
 TASK = [
     *("~env.layout", "~env.view", "~env.max_steps", "~env.obstacle", "~env.num_obstacles"),
-    *("~env.places", "env._target_=user_envs.Corridor", TRUSTED),
+    *("env._target_=user_envs.Corridor", TRUSTED),
     *("env.num_envs=4", "+env.pays=10.0", "device=cpu", "total_frames=1000", "log_frames=500", "logger=csv"),
     *("evaluation.num_envs=4", "evaluation.episodes=4", "evaluation.final_episodes=4", "network.hidden_size=8"),
     *("evaluation.interval_frames=500", "network.widths=[8]"),

@@ -6,7 +6,8 @@ level, and the transforms that the environment needs. The training loop never as
 
 from hdrqn_torchrl.algorithms.base import Algorithm, make_recurrent_loss
 from hdrqn_torchrl.algorithms.flat import make_dqn, make_drqn
-from hdrqn_torchrl.algorithms.hierarchical import make_hdqn, make_hdrqn
+from hdrqn_torchrl.algorithms.hdqn import make_hdqn
+from hdrqn_torchrl.algorithms.hierarchical import make_hdrqn
 from hdrqn_torchrl.algorithms.levels import Level
 from hdrqn_torchrl.algorithms.presets import V3_LEARNER
 from hdrqn_torchrl.algorithms.v3 import make_v3

@@ -27,6 +27,7 @@ from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from hdrqn_torchrl.cli import sweeps
+from hdrqn_torchrl.cli.ledger import was_started
 from hdrqn_torchrl.cli.together import folder_of
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
@@ -59,9 +60,7 @@ class Job:
         sweeps.begin_elsewhere()
         os.chdir(self.config.hydra.runtime.cwd)
         config = self._composed(self.overrides)
-        if sweeps.was_started(config, self.number) and any(
-            (each / layout.CONFIG).exists() for each in _folders(config)
-        ):
+        if was_started(config, self.number) and any((each / layout.CONFIG).exists() for each in _folders(config)):
             config = self._composed([*self.overrides, "resume=auto"])
         return run_job(
             hydra_context=self.context, task_function=self.task, config=config,

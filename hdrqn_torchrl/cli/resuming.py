@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Sequence, Set
 from copy import deepcopy
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -272,34 +268,3 @@ def _without_copies(settings: dict[str, Any]) -> dict[str, Any]:
         if isinstance(logger, dict):
             logger.pop("settings", None)
     return settings
-
-
-def record(run: Plan) -> None:
-    """Writes ``config.yaml`` and, at the beginning, ``run.json`` (where the run comes from)."""
-    from hdrqn_torchrl.runs.persistence.files import write_whole
-
-    if not (run.folder / layout.ORIGIN).exists():
-        origin = {
-            "choices": run.choices,
-            "overrides": list(HydraConfig.get().overrides.task),
-            "command": " ".join(sys.argv),
-            "init_from": None if run.weights is None else str(run.weights),
-            "commit": _commit(),
-            "versions": {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")},
-        }
-        write_whole(run.folder / layout.ORIGIN, json.dumps(origin, indent=2) + "\n")
-    write_whole(run.folder / layout.CONFIG, OmegaConf.to_yaml(OmegaConf.create(as_plain(run.config))))
-
-
-def _commit() -> str | None:
-    """Commit of this program's files, if they are part of a git repository."""
-    try:
-        _git("ls-files", "--error-unmatch", Path(__file__).name)  # in a repository an installed package may lie, too
-        return _git("describe", "--always", "--dirty", "--abbrev=10")
-    except (OSError, subprocess.CalledProcessError):
-        return None
-
-
-def _git(*arguments: str) -> str:
-    folder = Path(__file__).parent
-    return subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True).stdout.strip()

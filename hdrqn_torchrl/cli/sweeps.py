@@ -10,17 +10,15 @@ from __future__ import annotations
 import atexit
 import contextlib
 import io
-import json
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from types import FrameType
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.utils import JobReturn, JobStatus
@@ -28,21 +26,15 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict, read_write
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+from hdrqn_torchrl.cli.ledger import DONE, STARTED, ledger_of, read_ledger, report, unfinished, write_note
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 POLL_SECONDS = 1.0
-REMEDY = "the same command with resume=auto goes on, with jobs that were not started, too"
 PATIENCE_SECONDS = 120.0
 """How long a job waits for another process in its folder: one of a killed sweep may still be saving itself."""
 JOBS_ON_A_GPU = 4
 """Jobs that ``sweep=parallel`` runs at once on a GPU unless told how many: each has a context of its own there."""
-STARTED, DONE = "started", "done"
 NOT_STARTED = "not started, as the sweep was stopped"
-Note = dict[str, Any]
 
 
 class JobStopped(RuntimeError):
@@ -111,21 +103,7 @@ class Sweep(Callback):
     def _note(self, config: DictConfig, state: str) -> None:
         assert self.ledger is not None
         if not _stop.orphaned:  # else the same command may have been started again: the ledger belongs to that sweep
-            _write(self.ledger, config, config.hydra.runtime.output_dir, state)
-
-
-def _write(ledger: Path, config: DictConfig, folder: str, state: str) -> None:
-    note = {
-        "job": config.hydra.job.num,
-        "folder": os.path.relpath(folder, config.hydra.runtime.cwd),
-        "overrides": list(config.hydra.overrides.task),
-        "state": state,
-    }
-    with ledger.open("a+b") as file, _alone(file):
-        file.seek(max(file.seek(0, os.SEEK_END) - 1, 0))
-        torn = file.read() not in (b"", b"\n")  # by a full disk, or a process that was killed
-        file.write(b"\n" * torn + json.dumps(note).encode() + b"\n")  # in one piece: other processes write here, too
-        file.flush()
+            write_note(self.ledger, config, config.hydra.runtime.output_dir, state)
 
 
 def note_lost(config: DictConfig, error: Exception) -> JobReturn:
@@ -136,7 +114,7 @@ def note_lost(config: DictConfig, error: Exception) -> JobReturn:
     if state == STARTED:
         if was_stopped() and config.hydra.job.num not in states:
             reason = NOT_STARTED
-        _write(ledger, config, f"{config.hydra.sweep.dir}/{config.hydra.sweep.subdir}", reason)
+        write_note(ledger, config, f"{config.hydra.sweep.dir}/{config.hydra.sweep.subdir}", reason)
         sys.stderr.write(f"job {config.hydra.job.num}: {reason}\n")
     return _fail(JobReturn(status=JobStatus.FAILED), config, reason)
 
@@ -148,15 +126,6 @@ def _fail(result: JobReturn, config: DictConfig, reason: str) -> JobReturn:
     return result
 
 
-@contextlib.contextmanager
-def _alone(file: BinaryIO) -> Iterator[None]:
-    """Locks a file that processes of other machines write to as well, where the operating system can."""
-    if fcntl is not None:
-        with contextlib.suppress(OSError):  # not every file system can
-            fcntl.lockf(file, fcntl.LOCK_EX)  # closing gives it back
-    yield
-
-
 def one_line(error: Exception) -> str:
     """Kind and first line of an error.
 
@@ -166,50 +135,6 @@ def one_line(error: Exception) -> str:
     """
     kind = "" if isinstance(error, JobStopped) else f"{type(error).__name__}: "
     return kind + str(error).partition("\n")[0]
-
-
-def ledger_of(config: DictConfig) -> Path:
-    """Where the notes of a sweep are."""
-    return Path(config.hydra.sweep.dir) / "jobs.jsonl"
-
-
-def was_started(config: DictConfig, job: int) -> bool:
-    """Whether this sweep began a job before."""
-    return any(note["job"] == job for note in read_ledger(ledger_of(config)))
-
-
-def read_ledger(ledger: Path) -> list[Note]:
-    """The last note about each job that was started, in the order of the jobs."""
-    lines = ledger.read_bytes().splitlines() if ledger.exists() else []
-    last = {note["job"]: note for line in lines if (note := _read(line))}
-    return [last[job] for job in sorted(last)]
-
-
-def _read(line: bytes) -> Note | None:
-    """A note, or ``None`` of a line that was not written to its end."""
-    try:
-        return json.loads(line)
-    except ValueError:
-        return None
-
-
-def unfinished(notes: list[Note]) -> list[Note]:
-    """Notes of the jobs that were not done."""
-    return [note for note in notes if note["state"] != DONE]
-
-
-def report(ledger: Path) -> None:
-    """Lists the unfinished jobs on stderr, each with the overrides that it does not share with all jobs, if any."""
-    notes = read_ledger(ledger)
-    shared = set.intersection(*(set(note["overrides"]) for note in notes)) if len(notes) > 1 else set()
-    if missing := unfinished(notes):
-        print(f"\nunfinished: {len(missing)} of {len(notes)} started jobs in {ledger.parent}", file=sys.stderr)
-    for note in missing:
-        own = " ".join(override for override in note["overrides"] if override not in shared)
-        reason = "stopped or killed" if note["state"] == STARTED else note["state"]
-        print(f"  {note['folder']} ({own})\n    {reason}", file=sys.stderr)
-    if missing:
-        print(REMEDY, file=sys.stderr)
 
 
 class _Stop:

@@ -19,7 +19,8 @@ from hdrqn_torchrl.cli import launchers, sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last, print_result, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors
-from hdrqn_torchrl.cli.resuming import Plan, command, plan, record, with_groups_of_run
+from hdrqn_torchrl.cli.origin import record
+from hdrqn_torchrl.cli.resuming import Plan, command, plan, with_groups_of_run
 from hdrqn_torchrl.cli.together import plans, train_together
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.persistence.files import check_file, remove, replaced

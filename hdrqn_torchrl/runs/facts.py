@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.envs.specs import interface
 from hdrqn_torchrl.runs.persistence import layout
-from hdrqn_torchrl.runs.persistence.files import read_json, write_whole
+from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json, write_whole
 from hdrqn_torchrl.runs.settings.arguments import shown
 
 Facts = dict[str, Any]
@@ -72,9 +72,12 @@ def warn_of_other_names(folder: Path, env: EnvBase) -> None:
         folder: of the run.
         env: bare environment in which its agent is to play.
     """
-    path = folder / layout.TASK
     facts = {name: each for name, each in facts_of(env).items() if name.startswith("names of ")}
-    if path.exists() and (changed := _changed(path, facts, only=facts)):
+    try:
+        changed = _changed(folder / layout.TASK, facts, only=facts)
+    except (OSError, RunFileError):  # not there, as in runs of earlier versions, or damaged: the agent can play
+        return
+    if changed:
         warnings.warn(
             f"names should be those of the training in {folder}, got others: {'; '.join(changed)}. If their order "
             "changed, the agent means others than these names say.",

@@ -21,7 +21,7 @@ from hydra.types import HydraContext
 from processes import run_script
 from programs import ROOT, TINY, TINY_HDRQN, wait_until
 
-from hdrqn_torchrl.cli import launchers, sweeps
+from hdrqn_torchrl.cli import launchers, ledger, sweeps
 from hdrqn_torchrl.cli.configuration import CONF
 
 LONG = ["total_frames=6000", "log_frames=500", "evaluation.interval_frames=3000", "evaluation.ceilings=false"]
@@ -98,10 +98,10 @@ class TestJob:
         job = launchers.Job(Begun(tmp_path, name).launcher, 0, ["algo=hdqn", "seed=3"])
         assert isinstance(job.lost(ValueError("its machine burns")).return_value, RuntimeError)
         assert capsys.readouterr().err == "job 0: ValueError: its machine burns\n"
-        (note,) = sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl")
+        (note,) = ledger.read_ledger(tmp_path / "sweep" / "jobs.jsonl")
         assert note["folder"].endswith("sweep/0-gridworld-hdqn-seed3")
         job.lost(ValueError("so they say"))
-        assert sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl") == [note]
+        assert ledger.read_ledger(tmp_path / "sweep" / "jobs.jsonl") == [note]
 
 
 @needs_ray
@@ -208,7 +208,7 @@ def test_a_preempted_job_with_several_seeds_goes_on_with_each_where_it_was(tmp_p
         frames = [row["frames"] for row in of(seed)]
         assert frames == [row["frames"] for row in undisturbed]
         assert json.loads((tmp_path / f"sweep/0-gridworld-hdqn-seed{seed}/summary.json").read_text())["frames"] >= 6000
-    assert [note["state"] for note in sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl")] == ["done"]
+    assert [note["state"] for note in ledger.read_ledger(tmp_path / "sweep" / "jobs.jsonl")] == ["done"]
 
 
 @needs_ray
@@ -220,7 +220,7 @@ def test_a_killed_job_of_ray_goes_on_elsewhere(tmp_path, undisturbed):
     assert process.returncode == 0, told
     assert process_of(tmp_path) != first
     assert without_times(logged(tmp_path)) == undisturbed
-    assert [note["state"] for note in sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl")] == ["done"]
+    assert [note["state"] for note in ledger.read_ledger(tmp_path / "sweep" / "jobs.jsonl")] == ["done"]
 
 
 @pytest.mark.slow

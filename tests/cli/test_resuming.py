@@ -15,9 +15,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf, open_dict
 from run_folders import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
 
-from hdrqn_torchrl.cli import resuming
+from hdrqn_torchrl.cli import origin
 from hdrqn_torchrl.cli.configuration import resolved
-from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, plan, record, with_groups_of_run
+from hdrqn_torchrl.cli.origin import record
+from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, plan, with_groups_of_run
 from hdrqn_torchrl.runs.persistence.layout import holds_run, split
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 from hdrqn_torchrl.runs.settings.run_settings import as_plain, check
@@ -420,4 +421,4 @@ class TestRecord:
 
     def test_without_git_no_commit_is_recorded(self, monkeypatch):
         monkeypatch.setenv("PATH", "")
-        assert resuming._commit() is None
+        assert origin._commit() is None

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from processes import run_script
 from programs import ROOT, TINY, TINY_HDRQN, call, wait_until
 
-from hdrqn_torchrl.cli import sweeps
+from hdrqn_torchrl.cli import ledger, sweeps
 from hdrqn_torchrl.cli.configuration import CONF
 from hdrqn_torchrl.runs.interruption import Interrupted
 
@@ -71,7 +71,7 @@ def test_the_list_of_failed_jobs_comes_last(parallel):
         f"    SettingsError: {WRONG}; the paper uses 0.99.",
         "  sweep/5-gridworld-hdqn-seed5 (seed=5 algo.gamma=7)",
         f"    SettingsError: {WRONG}; the paper uses 0.99.",
-        sweeps.REMEDY,
+        ledger.REMEDY,
     ]
     assert "Traceback" not in done.stderr
 
@@ -97,8 +97,8 @@ def test_a_search_maximises_and_survives_failed_trials(tmp_path):
     # Without -m: sweep=search alone says that this is a sweep.
     search = ["sweep=search", "hydra.sweeper.n_trials=4", "algo.gamma=choice(0.9,7)", "algo.sub.tau=0.02"]
     code, _, told = run_script(tmp_path, *search, *COMMON, prepare=finish_as_a_program)
-    notes = sweeps.read_ledger(tmp_path / "sweep" / "jobs.jsonl")
-    failed = sweeps.unfinished(notes)
+    notes = ledger.read_ledger(tmp_path / "sweep" / "jobs.jsonl")
+    failed = ledger.unfinished(notes)
     assert len(notes) == 4 and 0 < len(failed) < 4
     assert all(WRONG in note["state"] for note in failed) and f"unfinished: {len(failed)} of 4" in told
     assert code == 1
@@ -224,7 +224,7 @@ class TestCallback:
     def test_the_ledger_of_an_earlier_sweep_in_the_same_folder_is_replaced(self, callback, tmp_path):
         callback.on_job_start(job_config(tmp_path))
         callback.on_multirun_start(job_config(tmp_path))
-        assert sweeps.read_ledger(callback.ledger) == []
+        assert ledger.read_ledger(callback.ledger) == []
 
     def test_a_single_run_is_left_alone(self, tmp_path):
         callback, result = sweeps.Sweep(), job_return(ValueError("x"))
@@ -238,7 +238,7 @@ class TestCallback:
         callback.on_job_end(job_config(tmp_path), result)
         callback.on_multirun_end(job_config(tmp_path))
         assert result.return_value == 1.5
-        assert [note["state"] for note in sweeps.read_ledger(callback.ledger)] == ["done"]
+        assert [note["state"] for note in ledger.read_ledger(callback.ledger)] == ["done"]
 
     def test_a_failed_job_does_not_reach_the_sweeper_that_would_raise_it(self, callback, tmp_path, capsys):
         result = job_return(ValueError("first line\nsecond line"))
@@ -261,11 +261,11 @@ class TestCallback:
         for number in range(3):
             callback.on_job_start(job_config(tmp_path, number=number, overrides=["env=x", f"seed={number}"]))
         callback.on_job_end(job_config(tmp_path, number=1, overrides=["env=x", "seed=1"]), job_return(0.0))
-        sweeps.report(callback.ledger)
+        ledger.report(callback.ledger)
         lines = [line.strip() for line in capsys.readouterr().err.splitlines()]
         assert lines[1] == f"unfinished: 2 of 3 started jobs in {tmp_path}"
         assert [line.rpartition("/")[2] for line in lines[2:]] == [
-            "job0 (seed=0)", "stopped or killed", "job2 (seed=2)", "stopped or killed", sweeps.REMEDY,
+            "job0 (seed=0)", "stopped or killed", "job2 (seed=2)", "stopped or killed", ledger.REMEDY,
         ]  # fmt: skip
 
     def test_a_note_that_was_torn_off_spoils_no_other(self, callback, tmp_path):
@@ -273,10 +273,10 @@ class TestCallback:
         with callback.ledger.open("a") as file:
             file.write('{"job": 1, "st')
         callback.on_job_start(job_config(tmp_path, number=2))
-        assert [note["job"] for note in sweeps.read_ledger(callback.ledger)] == [0, 2]
+        assert [note["job"] for note in ledger.read_ledger(callback.ledger)] == [0, 2]
 
     def test_no_report_without_unfinished_jobs(self, tmp_path, capsys):
-        sweeps.report(tmp_path / "jobs.jsonl")
+        ledger.report(tmp_path / "jobs.jsonl")
         assert capsys.readouterr().err == ""
 
 
@@ -340,7 +340,7 @@ class TestStop:
         callback.on_multirun_start(job_config(tmp_path))
         sweeps._stop.orphaned = True
         callback.on_job_end(job_config(tmp_path), job_return(RuntimeError("stopped")))
-        assert sweeps.read_ledger(callback.ledger) == []
+        assert ledger.read_ledger(callback.ledger) == []
 
     def test_a_stopped_job_in_the_main_process_ends_the_program(self):
         with pytest.raises(SystemExit) as stop:

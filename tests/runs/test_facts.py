@@ -54,3 +54,5 @@ def test_other_names_are_warned_of_and_another_length_is_not(run):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_other_names(run, small_env(max_steps=9))
+        (run / "task.json").write_text("{")  # an agent can play without
+        warn_of_other_names(run, small_env())

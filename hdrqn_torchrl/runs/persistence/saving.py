@@ -69,8 +69,9 @@ class Saving:
         """
         if not self._whole:
             return
+        if given_up:
+            self._saved = ()
         try:
-            self._saved = () if given_up else self._saved
             self.save(frames)
         except Exception as failed:  # that which came first is to be told
             error.add_note(f"The training could not be saved, either: {failed}")

@@ -1,3 +1,4 @@
+import inspect
 import json
 from pathlib import Path
 
@@ -308,6 +309,14 @@ def test_what_the_agent_sees_is_black_beyond_the_screen():
 def test_wrong_settings_of_montezuma_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         MontezumaEnv(**settings)
+
+
+def test_the_builder_has_the_settings_of_the_environment_and_its_own():
+    def arguments(of):
+        return {name: each.default for name, each in inspect.signature(of).parameters.items() if name != "self"}
+
+    own = {"view": 70, "size": 44, "keep_pixels": False}
+    assert arguments(make_montezuma) == arguments(MontezumaEnv.__init__) | own
 
 
 def test_all_18_actions_are_the_default():
