@@ -68,7 +68,8 @@ def skip_exported(app: Any, what: str, name: str, thing: Any, skip: bool, option
     page = app.env.current_document.autodoc_module or ""
     if what != "module" or not page.startswith(PACKAGE):
         return None
-    return True if any(vars(package).get(name) is thing for package in packages_above(page)) else None
+    above = [package for package in packages_above(page) if name in getattr(package, "__all__", ())]
+    return True if any(getattr(package, name) is thing for package in above) else None
 
 
 def find_exported(app: Any, env: Any, node: Any, content: Any) -> Any:

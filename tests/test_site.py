@@ -3,6 +3,9 @@
 import re
 import subprocess
 import sys
+from contextlib import suppress
+from functools import cache, reduce
+from importlib import import_module
 
 import pytest
 from processes import ROOT
@@ -10,6 +13,7 @@ from processes import ROOT
 DOCS = ROOT / "docs"
 PAGES = {page.relative_to(DOCS).with_suffix("").as_posix(): page for page in sorted(DOCS.rglob("*.md"))}
 PAGES = {name: page for name, page in PAGES.items() if not name.startswith("_build/")}
+SOURCES = sorted((ROOT / "hdrqn_torchrl").rglob("*.py"))
 
 
 def contents(page):
@@ -38,6 +42,26 @@ def test_notebooks_of_the_site_compile(name):
     for code in cells:
         if not code.startswith("%%bash"):
             compile(re.sub(r"^:.*\n", "", code), name, "exec")
+
+
+@cache
+def found(target):
+    """Whether a full name is a module, or something in one."""
+    parts = target.split(".")
+    for end in range(len(parts), 0, -1):
+        with suppress(ImportError, AttributeError):
+            module = import_module(".".join(parts[:end]))
+            owner = reduce(getattr, parts[end:-1], module)
+            named = {name for each in getattr(owner, "__mro__", ()) for name in vars(each).get("__annotations__", ())}
+            return end == len(parts) or hasattr(owner, parts[-1]) or parts[-1] in named
+    return False
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_docstrings_and_pages_refer_to_is_there(path):
+    """Sphinx finds it out, too, in minutes."""
+    targets = re.findall(r":(?:class|func|meth|mod|data|attr|exc):`~?(hdrqn_torchrl[\w.]*)`", path.read_text())
+    assert [target for target in targets if not found(target)] == []
 
 
 @pytest.mark.slow  # minutes: all notebooks run
