@@ -130,7 +130,7 @@ class SequenceLoss(LossModule):
     def _prediction_loss(
         self, memory: Tensor, action: Tensor, observation: Tensor, *, valid: Tensor, cut: Tensor
     ) -> Tensor:
-        """Mean error of what the memory expects to see (:func:`~hdrqn_torchrl.objectives.prediction.prediction_loss`)."""
+        """Mean error of what the memory expects (:func:`~hdrqn_torchrl.objectives.prediction.prediction_loss`)."""
         assert self._predictor is not None
         return prediction_loss(self._predictor, memory, action, observation, valid=valid, cut=cut, ahead=self.ahead)
 
