@@ -1,7 +1,9 @@
 """TensorDict keys shared by environments, modules, replay and losses.
 
-Every class takes its keys as arguments; these are the defaults. Shapes leave out the batch dimensions; ``G`` is the
-number of subgoals, ``H`` the size of an LSTM state.
+Classes take their keys as arguments, of which these are the defaults; how an episode ends and begins (``done``,
+``terminated``, ``truncated``, ``is_init``) has the names that TorchRL gives it wherever it is the end of an episode and
+not of something else. Shapes leave out the batch dimensions; ``G`` is the number of subgoals, ``H`` the size of an LSTM
+state.
 """
 
 from __future__ import annotations

@@ -35,6 +35,12 @@ def test_files_that_a_page_links_to_are_there(name):
     assert missing == []
 
 
+@pytest.mark.parametrize("name", [name for name in PAGES if name != "changelog"])
+def test_files_of_this_project_that_a_page_names_are_there(name):
+    paths = re.findall(r"`((?:tests|hdrqn_torchrl|conf|benchmarks|examples)/[\w/.-]+\.\w+)`", PAGES[name].read_text())
+    assert [path for path in paths if not (ROOT / path).exists()] == []
+
+
 @pytest.mark.parametrize("name", [name for name in PAGES if name.startswith("tutorials/")])
 def test_notebooks_of_the_site_compile(name):
     cells = re.findall(r"```\{code-cell\} ipython3\n(.*?)```", PAGES[name].read_text(), flags=re.S)

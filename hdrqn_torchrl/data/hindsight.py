@@ -16,7 +16,7 @@ from tensordict.utils import expand_as_right
 from torch import Tensor
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.data.options import OptionExtractor
+from hdrqn_torchrl.data.options import OptionExtractor, episode_of
 from hdrqn_torchrl.transforms import IntrinsicReward, advance_option
 
 
@@ -41,11 +41,12 @@ def relabel_subgoals(
     Relabelled for a subgoal g other than the one pursued at its first step, a sequence differs as acting would have:
 
     - g is in force throughout, and reward and termination of each step are those of g;
-    - the option ends where g is reached. Reaching the subgoal really pursued, or losing it, does not end an
-      option for g, so there the recurrent state goes on; to cut the sequence there would leave out steps *because* of
-      what they attained, which biases values. Every other end (episode, time limit) ends one for g, too;
-    - where g could not be chosen any more, since it had been attained before, a step is not eligible for the loss.
-      The next eligible one starts an episode, so these steps reach no target and no state that is trained.
+    - the option ends where g is reached, or can't be chosen any more. Reaching the subgoal really pursued, or losing
+      it, does not end an option for g, so there the recurrent state goes on; to cut the sequence there would leave out
+      steps *because* of what they attained, which biases values. Every other end (episode, time limit) ends one for
+      g, too;
+    - where g could not be chosen, since it had been attained before or was not available, a step is not eligible for
+      the loss. The next eligible one starts an option, so these steps reach no target and no state that is trained.
 
     Args:
         sample: sequences ``[B, T]`` of the sub level with ``attained``, ``hazard`` and ``subgoal_mask``.
@@ -83,7 +84,9 @@ def relabel_subgoals(
     reached = attained.gather(-1, subgoal)
     terminated = reached | after.get(keys.TERMINATED)
     cut = after.get(option_done_key) & ~attained.gather(-1, pursued) & left.gather(-1, pursued)
-    done = terminated | cut | after.get(keys.DONE)
+    eligible = left.gather(-1, subgoal)
+    lost = ~eligible | torch.cat([~eligible[:, 1:], torch.zeros_like(eligible[:, :1])], 1)
+    done = terminated | cut | lost | after.get(keys.DONE)
     init = torch.cat([told.get(option_init_key)[:, :1], done[:, :-1]], 1)
     reward = rewards.of(attained, reached, None if hazard_key is None else after.get(hazard_key))
     for part, key, value in (
@@ -96,7 +99,7 @@ def relabel_subgoals(
     told.set(subgoal_key, subgoal.squeeze(-1))
     for key in state_keys:
         told.set(key, told.get(key).masked_fill(shift > 0, 0.0))
-    return told.set(eligible_key, (shift == 0) | left.gather(-1, subgoal))
+    return told.set(eligible_key, (shift == 0) | eligible)
 
 
 class HindsightOptions:
@@ -155,7 +158,7 @@ class HindsightOptions:
         self._changed: Tensor | None = None  # numbers of the episodes in progress that are relabelled
 
     def reset(self) -> None:
-        """Forgets options and episodes in progress (the collector started new episodes)."""
+        """Forgets options in progress, and those that wait for the end of their episode."""
         self._forget()
         self.pursued.reset()
         self.retold.reset()
@@ -218,7 +221,7 @@ class HindsightOptions:
             return None
         number = options.get(self.retold.traj_key)
         options.set(self.retold.traj_key, -1 - number)
-        return options[torch.isin(number, changed)]
+        return options[torch.isin(episode_of(number), changed)]
 
     def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""

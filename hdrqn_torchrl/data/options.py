@@ -24,8 +24,8 @@ class OptionExtractor:
     Rows come out by whole episodes, each in order and without gaps, once the episode is over; so a replay buffer can
     hold them one after the other. Of an episode that is very long or has no end, a piece comes out from time to time. A
     piece also ends with a final row: a copy of the row that the next piece begins with. So each option is learned
-    from, but sequences do not go from one piece to the next. Batches must come from one collector, in order, with the
-    same N environments.
+    from, but sequences do not go from one piece to the next, as each has a number of its own (:func:`episode_of`).
+    Batches must come from one collector, in order, with the same N environments.
 
     Args:
         input_keys: what the controller reads, kept from where the option started.
@@ -101,10 +101,12 @@ class OptionExtractor:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets options and episodes in progress (the collector started new episodes)."""
+        """Forgets options in progress, and those that wait for the end of their episode."""
         self._open_starts: TensorDictBase | None = None  # [N]: start of the option in progress
         self._is_open: Tensor | None = None  # [N]
         self._held: TensorDictBase | None = None  # [M]: finished options of unfinished episodes
+        self._pieces: Tensor | None = None  # [N]: pieces that came out of the episode ...
+        self._episode: Tensor | None = None  # [N]: ... of this number
         if self.history is not None:
             self.history.reset()
 
@@ -189,6 +191,10 @@ class OptionExtractor:
         if self.history is not None:
             self._look_back(options)
         environment, rows = options.get(_ENVIRONMENT), torch.arange(len(options), device=options.device)
+        if self._pieces is None or self._episode is None:
+            self._pieces, self._episode = torch.zeros((2, num_envs), dtype=torch.int64, device=options.device)
+        episode = options.get(self.traj_key)
+        numbers = episode + _PIECE * torch.where(episode == self._episode[environment], self._pieces[environment], 0)
         ends = torch.where(options.get(_OVER), rows, -1)
         last_end = rows.new_full((num_envs,), -1).scatter_reduce(0, environment, ends, "amax")
         complete = rows <= last_end[environment]
@@ -198,9 +204,12 @@ class OptionExtractor:
         complete |= goes_on[environment]
         complete[newest] = False  # the next piece begins with it
         self._held = options[(~complete).nonzero().squeeze(-1)]
+        options.set(self.traj_key, numbers)
         released = options[complete.nonzero().squeeze(-1)]
         if len(newest):
             released = _by_environment(released, self._as_final(options[newest]))
+            self._pieces = self._pieces.masked_scatter(goes_on, numbers[newest] // _PIECE + 1)
+            self._episode = self._episode.masked_scatter(goes_on, episode[newest])
         return released.exclude(_ENVIRONMENT, _OVER, _OWN) if len(released) else None
 
     def _look_back(self, options: TensorDictBase) -> None:
@@ -215,6 +224,7 @@ class OptionExtractor:
     def state_dict(self) -> dict[str, Any]:
         """Options and episodes in progress."""
         state: dict[str, Any] = {"open_starts": self._open_starts, "is_open": self._is_open, "held": self._held}
+        state |= {"pieces": self._pieces, "episode": self._episode}
         return state if self.history is None else {**state, "history": self.history.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -222,8 +232,26 @@ class OptionExtractor:
         self._open_starts, self._is_open, self._held = state["open_starts"], state["is_open"], state["held"]
         if self._held is not None and _OVER not in self._held:
             self._held = None
+        self._pieces, self._episode = state.get("pieces"), state.get("episode")
         if self.history is not None:
             self.history.load_state_dict(state["history"])
+
+
+_PIECE = 2**44
+"""Added to the number of a long episode for each piece of it that came out before."""
+
+
+def episode_of(number: Tensor) -> Tensor:
+    """The number of the episode that options are of, whichever piece of it they came out in.
+
+    Args:
+        number: entry of :class:`OptionExtractor`'s rows.
+
+    Examples:
+        >>> episode_of(torch.tensor([7, 7 + 2**44, 7 + 2**45]))
+        tensor([7, 7, 7])
+    """
+    return number % _PIECE
 
 
 _ENVIRONMENT, _OVER, _OWN = "environment", "over", "own"
@@ -278,8 +306,11 @@ class StepSelector:
         truncated = [keys.TRUNCATED] if keys.TRUNCATED in after else []  # not every environment has it
         return steps.set("next", after.select(*self.next_keys, *truncated))
 
+    def reset(self) -> None:
+        """Forgets nothing: it looks at one batch at a time."""
+
     def state_dict(self) -> dict[str, Any]:
-        """Nothing: it looks at one batch at a time."""
+        """Nothing, likewise."""
         return {}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

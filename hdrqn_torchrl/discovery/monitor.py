@@ -81,6 +81,7 @@ class Discovery:
     def _forget(self) -> None:
         for learner in (self.steps, *self.options):
             learner.begin_empty()
+            learner.extract.reset()  # options wait there for the end of their episode
 
     def _discover(self) -> None:
         table, chosen = self.critic.table, self.selection.update()

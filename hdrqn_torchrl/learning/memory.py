@@ -20,6 +20,9 @@ class Extract(Protocol):
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase | None: ...
 
+    def reset(self) -> None:
+        """Forgets what it carries from batch to batch."""
+
     def state_dict(self) -> dict[str, Any]:
         """What it carries from batch to batch."""
 

@@ -58,6 +58,8 @@ class VisitCounter:
         after = batch.get("next")
         attained, done = after.get(self.attained_key).float(), after.get(keys.DONE)
         visits, sums = torch.zeros_like(attained[:, 0]) if self._open is None else self._open, []
+        if (init := batch.get(keys.IS_INIT, None)) is not None:
+            visits = visits.masked_fill(init[:, 0], 0.0)  # an episode in progress was lost between two batches
         for now, end in zip(attained.unbind(1), done.unbind(1), strict=True):
             sums.append(visits + now)
             visits = sums[-1].masked_fill(end, 0.0)

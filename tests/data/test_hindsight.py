@@ -11,7 +11,14 @@ from torchrl.envs import Compose, InitTracker, TransformedEnv
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import make_hdqn, make_hdrqn
-from hdrqn_torchrl.data import HindsightOptions, OptionExtractor, OptionHistory, StepSelector, relabel_subgoals
+from hdrqn_torchrl.data import (
+    HindsightOptions,
+    OptionExtractor,
+    OptionHistory,
+    StepSelector,
+    episode_of,
+    relabel_subgoals,
+)
 from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.transforms import IntrinsicReward, SubgoalTransform
 
@@ -90,7 +97,7 @@ class TestRelabelSubgoals:
             # Goal 0 ends with its being attained; afterwards it could not be chosen.
             (
                 ON_THE_WAY,
-                {"pursued": "0000", "reward": [0.0, 1.0, -1.0, -0.5], "init": "02", "done": "13", "terminated": "13",
+                {"pursued": "0000", "reward": [0.0, 1.0, -1.0, -0.5], "init": "023", "done": "123", "terminated": "13",
                  "eligible": "01"},
             ),
             # If it can be attained again, a new option to it starts there.
@@ -102,8 +109,15 @@ class TestRelabelSubgoals:
             # It had been attained before the sequence.
             (
                 ON_THE_WAY | {"mask": "01 01 01 01", "attained": "00 00 00 01", "reward": [0.0, 0.0, -1.0, 1.0]},
-                {"pursued": "0000", "reward": [0.0, 0.0, -1.0, -0.5], "init": "0", "done": "3", "terminated": "3",
+                {"pursued": "0000", "reward": [0.0, 0.0, -1.0, -0.5], "init": "0123", "done": "0123", "terminated": "3",
                  "eligible": ""},
+            ),
+            # It can't be chosen for a while: the option ends there, and another one starts when it can again.
+            (
+                {"pursued": "111111", "attained": "00 00 00 00 00 00", "mask": "11 11 01 01 11 11", "init": "0",
+                 "done": "", "reward": [0.0] * 6},
+                {"pursued": "000000", "reward": [0.0] * 6, "init": "0234", "done": "123", "terminated": "",
+                 "eligible": "0145"},
             ),
             # Options cut by a time limit of two steps are cut for goal 1, too, and not terminated.
             (
@@ -151,7 +165,7 @@ class TestRelabelSubgoals:
         """As ``sampling="episode_starts"`` gives them: what was attained in the first can be in the second."""
         first, second = sequence(**ON_THE_WAY), sequence(**ON_THE_WAY)
         told = shown(relabel_subgoals(torch.cat([first, second], 1), 2)[1])
-        assert (told["init"], told["done"], told["eligible"]) == ("0246", "1357", "0145")
+        assert (told["init"], told["done"], told["eligible"]) == ("023467", "123567", "0145")
 
     def test_three_subgoals_triple_the_sequences(self):
         """Every sequence appears once for each subgoal, counted on from the one it began with."""
@@ -697,13 +711,17 @@ def test_an_episode_that_comes_out_in_pieces_is_relabelled_in_the_same_way(num_e
         flat = [options[key].reshape(len(options), -1).double() for key in (*columns, *numbers)]
         return {tuple(row) for row in torch.cat(flat, 1).tolist()}
 
+    def number(options):
+        own = options["collector", "traj_ids"]
+        return options.set(("collector", "traj_ids"), torch.where(own < 0, -1 - episode_of(-1 - own), episode_of(own)))
+
     told = []
     for max_held in (1, 1_000):
         pursued = OptionExtractor(max_held=max_held)
         retold = OptionExtractor(active_subgoal_key=keys.HINDSIGHT_SUBGOAL, max_held=max_held)
         extractor = HindsightOptions(pursued, retold, gamma=0.9)
         taken = [extractor(batch) for batch in batches_of(random_play(num_envs, 102), length)]
-        told.append(rows(torch.cat([options for options in taken if options is not None])))
+        told.append(rows(number(torch.cat([options for options in taken if options is not None]))))
     pieces, whole = told
     episodes = {row[0] for row in whole}
     pieces = {row for row in pieces if row[0] in episodes}  # others are not over

@@ -4,8 +4,15 @@ import pytest
 import torch
 from helpers import batches_of, options_of, random_play
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
-from hdrqn_torchrl.data import OptionExtractor, OptionHistory, StepSelector
+from hdrqn_torchrl.data import (
+    OptionExtractor,
+    OptionHistory,
+    StepSelector,
+    StepSliceSampler,
+    episode_of,
+)
 
 SHAPES = [(1, 2), (3, 2), (3, 3), (6, 17), (5, 1), (1, 17)]
 
@@ -134,6 +141,7 @@ class TestEpisodesWithoutEnd:
         assert final.any() or mean_episode == 6
         taken = taken[(~taken["next", "done"] | taken["next", "terminated"]).squeeze(-1)]
         assert len(expected) > 40 * num_envs
+        taken["collector", "traj_ids"] = episode_of(taken["collector", "traj_ids"])
         by_start = [options[options["observation"].argsort()] for options in (taken, expected)]
         assert (by_start[0] == by_start[1]).all()  # the same transitions
         for n in range(num_envs):
@@ -145,6 +153,26 @@ class TestEpisodesWithoutEnd:
         assert torch.equal(stored["collector", "traj_ids"][went_on + 1], stored["collector", "traj_ids"][went_on])
         starts = steps["observation"][steps["is_init"].squeeze(-1)]
         assert (taken["is_init"].squeeze(-1) == torch.isin(taken["observation"], starts)).all()
+
+    @pytest.mark.parametrize("carry", [False, True], ids=["", "through its state"])
+    def test_a_sequence_does_not_go_from_one_piece_to_the_next(self, carry):
+        settings = {"input_keys": ["observation"], "mask_key": None, "max_held": 3}
+        extractor = OptionExtractor(**settings)
+        sampler = StepSliceSampler(slice_len=4, terminated_key=("next", "terminated"))
+        buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1_000), sampler=sampler, batch_size=4_000)
+        for batch in batches_of(endless(1, 300, mean_episode=60), 7):
+            if (options := extractor(batch)) is not None:
+                buffer.extend(options)
+            if carry:
+                state = deepcopy(extractor.state_dict())
+                extractor = OptionExtractor(**settings)
+                extractor.load_state_dict(state)
+        final = (buffer[:]["next", "done"] & ~buffer[:]["next", "terminated"]).squeeze(-1)
+        assert final.sum() > 20
+        drawn = buffer.sample().reshape(-1, 4)
+        real, over = drawn["collector", "mask"], drawn["next", "done"].squeeze(-1)
+        assert not (over[:, :-1] & real[:, 1:]).any()
+        assert not (over & ~drawn["next", "terminated"].squeeze(-1))[:, 0].any()  # nothing could be learned from it
 
     def test_a_short_episode_comes_out_whole_whatever_the_limit_of_others(self):
         steps = endless(2, 200, mean_episode=6)

@@ -72,6 +72,22 @@ def test_v2_relabels_steps_and_forgets_options_whose_subgoal_has_another_meaning
     assert stored["meta"][0] == stored["meta"][5] == 0 < stored["meta"][4]
 
 
+def test_options_that_wait_for_the_end_of_their_episode_are_forgotten_too():
+    agent, batches = agent_and_batches(8, name="v2", chosen=(Chosen({1: 1}), BOTH_GOALS, Chosen({2: 1})))
+    for batch in islice(batches, 5):
+        agent.observe(batch)
+    assert len(agent.learners["meta"].extract.state_dict()["held"])
+    last = next(batches)
+    agent.observe(last)
+    assert agent.learners["meta"].extract.state_dict()["held"] is None
+    for batch in batches:
+        agent.observe(batch)
+    options = agent.learners["meta"].buffer.storage[:]
+    steps = agent.learners["sub"].buffer.storage[:]
+    begun = steps["option_init"].sum()
+    assert len(options) > 0 and options["next", "option_steps"].bool().sum() <= begun
+
+
 def test_each_subgoal_reports_when_it_was_found():
     chosen = (Chosen({1: 1}), BOTH_GOALS, Chosen({2: 1}), Chosen({2: 1, 5: 1}))
     agent, batches = agent_and_batches(8, chosen=chosen)

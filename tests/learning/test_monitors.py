@@ -38,3 +38,14 @@ class TestVisitCounter:
         for each in (visits, other):
             each.observe(batch((FIRST, True)))
         assert self.columns(other) == self.columns(visits) == [1.0, 1.5, 0.5, 0.5]
+
+    def test_an_episode_that_was_lost_does_not_count_for_the_next(self):
+        """Workers that fail begin new episodes."""
+        visits = VisitCounter()
+        visits.observe(batch((BOTH, False)))
+        for begins, expected in ((True, [1.0, 1.0, 0.0, 0.0]), (False, [1.0, 1.0, 0.0, 0.0])):
+            following = batch((FIRST, False))
+            visits.observe(following.set("is_init", torch.tensor([[[begins]]])))
+            visits.observe(batch((NONE, True)).set("is_init", torch.tensor([[[False]]])))
+            assert self.columns(visits) == expected
+            visits.clear()
