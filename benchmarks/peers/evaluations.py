@@ -19,14 +19,15 @@ class Evaluation:
         bonus: for each subgoal attained, in training.
         seed: of the training.
         frames: environment steps so far.
-        seconds: wall time so far, evaluations included.
-        cpu_seconds: processor time so far, evaluations included.
+        seconds: wall time so far, likewise.
+        cpu_seconds: processor time so far, evaluations before this one included.
         episodes: number of them.
         return_mean: without the bonus.
         success_rate: share of episodes that complete the task.
         steps_mean: of all episodes.
         sampled_success_rate: of as many episodes in the same worlds with actions drawn from the policy; ``None``: it
             has no probabilities.
+        final: the last one of a training that has used up its frames or its time.
     """
 
     agent: str
@@ -41,6 +42,7 @@ class Evaluation:
     success_rate: float
     steps_mean: float
     sampled_success_rate: float | None = None
+    final: bool = False
 
 
 def append(path: Path, evaluation: Evaluation) -> None:

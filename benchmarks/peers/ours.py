@@ -13,20 +13,18 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from arguments import Arguments
 from evaluations import Evaluation, write
-from tasks import settings_of_task
+from tasks import LONG_EXPLORATION, settings_of_task
 
 ROOT = Path(__file__).parents[2]
-LONG_EXPLORATION = ("algo.sub_exploration.anneal_frames=400_000", "algo.meta_exploration.anneal_frames=800_000")
-SETTINGS_OF_TASKS = {"BabyAI-KeyCorridorS3R3-v0": LONG_EXPLORATION}
-"""What ``train.py`` is told beside the settings of ``conf/``; docs/minigrid.md says why."""
 PAUSE = 1.0
 """Seconds between two looks at the time that a run has used."""
+_LONGER = ("algo.sub_exploration.anneal_frames=400_000", "algo.meta_exploration.anneal_frames=800_000")
 _STOPS = (signal.SIGTERM, signal.SIGINT)
 _WELL = (0, *(128 + stop for stop in _STOPS), *(-stop for stop in _STOPS))  # exit codes: done, stopped
 
@@ -59,7 +57,7 @@ def settings_of(arguments: OurArguments) -> list[str]:
         "algo=v3",
         f"algo.levels={arguments.levels}",
         f"algo.bonus_reward={arguments.bonus}",
-        *SETTINGS_OF_TASKS.get(arguments.id, ()),
+        *(_LONGER if arguments.id in LONG_EXPLORATION else ()),
         f"seed={arguments.seed}",
         f"total_frames={arguments.frames}",
         "device=cpu",
@@ -78,6 +76,7 @@ def train(arguments: OurArguments) -> None:
     """Trains until frames or time are used up."""
     if spent(arguments.folder) >= arguments.seconds:
         return
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # or train.py would be left to itself, without a limit
     words = [sys.executable, str(ROOT / "train.py"), *settings_of(arguments)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(words, env=environment) as process:
@@ -112,8 +111,10 @@ def evaluations_of(arguments: OurArguments) -> list[Evaluation]:
     found = [_evaluation(arguments, _figures(row)) for row in rows_of(arguments.folder) if row.get("greedy/return")]
     summary = arguments.folder / "summary.json"
     if summary.exists():
-        final = _evaluation(arguments, json.loads(summary.read_text()))
-        found = [each for each in found if each.frames < final.frames] + [final]
+        last = _evaluation(arguments, json.loads(summary.read_text()), final=True)
+        return [each for each in found if each.frames < last.frames] + [last]
+    if found and spent(arguments.folder) >= arguments.seconds:
+        found[-1] = replace(found[-1], final=True)
     return found
 
 
@@ -130,7 +131,7 @@ def _figures(row: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def _evaluation(arguments: OurArguments, figures: dict[str, Any]) -> Evaluation:
+def _evaluation(arguments: OurArguments, figures: dict[str, Any], *, final: bool = False) -> Evaluation:
     return Evaluation(
         agent=arguments.agent,
         id=arguments.task,
@@ -143,6 +144,7 @@ def _evaluation(arguments: OurArguments, figures: dict[str, Any]) -> Evaluation:
         return_mean=float(figures["return_mean"]),
         success_rate=float(figures["success_rate"]),
         steps_mean=float(figures["steps_mean"]),
+        final=final,
     )
 
 

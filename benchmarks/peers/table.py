@@ -1,12 +1,14 @@
 """All results beside each other: ``python benchmarks/peers/table.py`` writes tables and a figure into docs/peers.md.
 
 Of each task, all agents at equal processor time and at equal frames: where the run that is the first to end has ended.
+Runs that are not over are left out, with a warning.
 Values between two evaluations are interpolated. Intervals are 95 % t intervals over seeds.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,7 +47,11 @@ PAGE, FIGURE = (Path(__file__).parents[2] / "docs" / name for name in ("peers.md
 def read_all(folder: Path) -> dict[str, Groups]:
     """Runs by task, and by agent and bonus: ours first, the others as :data:`AGENTS` has them."""
     tasks: dict[str, Groups] = defaultdict(lambda: defaultdict(list))
-    runs = [run for path in sorted(folder.glob("*.jsonl")) if (run := read(path))]
+    found = {path: run for path in sorted(folder.glob("*.jsonl")) if (run := read(path))}
+    for path, run in found.items():
+        if not run[-1].final:
+            print(f"left out: {path.name} is not over; the same command goes on", file=sys.stderr)
+    runs = [run for run in found.values() if run[-1].final]
     for run in sorted(runs, key=lambda run: (list(AGENTS).index(run[0].agent), -run[0].bonus)):
         tasks[run[0].id][label_of(run[0])].append(run)
     return {task: tasks[task] for task in sorted(tasks)}
@@ -139,7 +145,9 @@ def main() -> None:
     arguments = parser.parse_args()
     tasks = read_all(arguments.results)
     if not tasks:
-        parser.error(f"--results must be a folder with results (*.jsonl), got {arguments.results}.")
+        parser.error(
+            f"--results must be a folder with results (*.jsonl) of runs that are over, got {arguments.results}."
+        )
     text = arguments.page.read_text()
     for axis, mark in (("cpu_seconds", "at equal time"), ("frames", "at equal frames")):
         text = put(text, mark, table_of(tasks, axis))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from abc import ABC, abstractmethod
 
@@ -31,7 +32,8 @@ class Training(ABC):
         self.results = arguments.results / f"{self.name}.jsonl"
         env = self.make(min(EVALUATION_ENVS, arguments.episodes), seed=EVALUATION_SEED)
         self.evaluation_env = TransformedEnv(env, InitTracker())
-        self.start_clock(None)
+        self._intervals = 0  # that have passed
+        self._start_clock(None)
 
     def make(self, num_envs: int, seed: int | None = None) -> EnvBase:
         """Worlds of the task."""
@@ -44,7 +46,7 @@ class Training(ABC):
 
     @abstractmethod
     def advance(self) -> None:
-        """Trains a little, a small part of ``interval_frames``."""
+        """Trains a little, a small part of ``interval_frames``; or longer, and calls :meth:`look` itself."""
 
     @abstractmethod
     def player(self, *, greedy: bool) -> TensorDictModuleBase | None:
@@ -55,55 +57,79 @@ class Training(ABC):
         """Called after each evaluation, with its line on disk."""
 
     def resume(self) -> None:
-        """Leaves out lines after the frames that a checkpoint has; time goes on from the last one."""
-        known = [each for each in read(self.results) if each.frames <= self.frames] if self.frames else []
-        write(self.results, known)
-        self.start_clock(known[-1] if known else None)
+        """Leaves out lines after the frames that a checkpoint has; time goes on from the last one.
 
-    def start_clock(self, before: Evaluation | None) -> None:
+        Ends the program if that would leave out all of them.
+        """
+        lines = read(self.results)
+        if lines and lines[-1].final and self.used_up(lines[-1].frames, lines[-1].cpu_seconds):
+            self._start_clock(lines[-1])
+            self._is_over = True
+            return
+        known = [each for each in lines if each.frames <= self.frames] if self.frames else []
+        if len(lines) > 1 and not known:
+            sys.exit(
+                f"error: {self.results} must be moved away to begin anew, got {len(lines)} evaluations of a training "
+                "that can't go on, as there is no checkpoint of it; results=FOLDER writes to another place."
+            )
+        write(self.results, known)
+        self._start_clock(known[-1] if known else None)
+        self._intervals = self.frames // self.arguments.interval_frames
+
+    def _start_clock(self, before: Evaluation | None) -> None:
         """Time goes on from that of the last evaluation."""
-        self._before, self._started, self._cpu_started = before, time.monotonic(), time.process_time()
+        began, cpu_began = (before.seconds, before.cpu_seconds) if before else (0.0, 0.0)
+        self._began, self._cpu_began = time.monotonic() - began, time.process_time() - cpu_began
+        self._is_over = False
 
     @property
     def seconds(self) -> float:
         """Wall time of the training so far."""
-        return (self._before.seconds if self._before else 0.0) + time.monotonic() - self._started
+        return time.monotonic() - self._began
 
     @property
     def cpu_seconds(self) -> float:
         """Processor time of the training so far."""
-        return (self._before.cpu_seconds if self._before else 0.0) + time.process_time() - self._cpu_started
+        return time.process_time() - self._cpu_began
 
-    @property
-    def is_over(self) -> bool:
-        """Whether frames or time are used up."""
-        return self.frames >= self.arguments.frames or self.cpu_seconds >= self.arguments.seconds
+    def used_up(self, frames: int, cpu_seconds: float) -> bool:
+        """Whether there are neither frames nor time left."""
+        return frames >= self.arguments.frames or cpu_seconds >= self.arguments.seconds
 
     def train(self) -> None:
         """Goes on until frames or time are used up, with evaluations in between."""
-        arguments = self.arguments
+        if self._is_over:
+            return
         if not self.frames:
             self.record()
-        over = self.is_over
-        while not over:
-            before = self.frames // arguments.interval_frames
+        while not self._is_over:
             self.advance()
-            over = self.is_over
-            if over:
-                self.record(final=True)
-            elif self.frames // arguments.interval_frames > before:
-                self.record()
+            self.look()
+
+    def look(self) -> bool:
+        """Evaluates where it is time to; returns whether the training is over."""
+        intervals = self.frames // self.arguments.interval_frames
+        if not self._is_over and self.used_up(self.frames, self.cpu_seconds):
+            self._is_over = True
+            self.record(final=True)
+        elif intervals > self._intervals:
+            self.record()
+        self._intervals = intervals
+        return self._is_over
 
     def record(self, *, final: bool = False) -> None:
         """Plays, writes a line, then saves: a checkpoint's line is always there.
 
-        Ours has no other way to play than the greedy one, so the time of the second evaluation does not count.
+        As of ours, a line has the time before its evaluation. Ours has no other way to play than the greedy one, so the
+        time of the second evaluation does not count.
         """
-        arguments = self.arguments
+        arguments, seconds, cpu_seconds = self.arguments, self.seconds, self.cpu_seconds
         found = self.evaluate(final=final, greedy=True)
         assert found is not None, "every agent plays greedily"
-        seconds, cpu_seconds = self.seconds, self.cpu_seconds  # until here
+        began, cpu_began = time.monotonic(), time.process_time()
         sampled = self.evaluate(final=final, greedy=False)
+        self._began += time.monotonic() - began
+        self._cpu_began += time.process_time() - cpu_began
         told = Evaluation(
             agent=self.agent,
             id=arguments.task,
@@ -117,11 +143,11 @@ class Training(ABC):
             success_rate=found["success_rate"],
             steps_mean=found["steps_mean"],
             sampled_success_rate=None if sampled is None else sampled["success_rate"],
+            final=final,
         )
         append(self.results, told)
         print(told, flush=True)
         self.save()
-        self.start_clock(told)
 
     def evaluate(self, *, final: bool, greedy: bool) -> dict[str, float] | None:
         """The averages of episodes; ``None``: the agent does not play like that."""

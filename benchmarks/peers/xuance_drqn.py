@@ -1,6 +1,6 @@
 """DRQN of XuanCe: ``python benchmarks/peers/xuance_drqn.py id=gridworld seconds=1200``.
 
-It keeps no checkpoint: a run that was stopped begins anew. ``arguments.py`` has all arguments. XuanCe asks for older
+It keeps no checkpoint: a run that was stopped can't go on. ``arguments.py`` has all arguments. XuanCe asks for older
 versions of NumPy and Gymnasium than this project, with which it works nevertheless: ``pip install --no-deps xuance``,
 and what it then misses (pyglet 1.5.15, moviepy 1.0.3, wandb, pettingzoo, opencv-python-headless, pygame).
 """
@@ -10,6 +10,8 @@ from __future__ import annotations
 import sys
 import tempfile
 from argparse import Namespace
+from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -17,17 +19,19 @@ import torch
 from arguments import Arguments
 from gymnasium import spaces
 from numpy.typing import NDArray
+from tasks import exploration_of
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl import torchrl_logger
 from training import Training
 from worlds import OneHot, Worlds
+from xuance.common import BaseCallback, EpisodeBuffer, RecurrentOffPolicyBuffer
 from xuance.torch.agents import DRQN_Agent
 from xuance.torch.agents.qlearning_family import drqn_agent
 
 from hdrqn_torchrl import keys
 
-NUM_ENVS, CHUNK, CAPACITY = 10, 10_000, 200_000
+NUM_ENVS, CAPACITY = 10, 200_000
 SETTINGS: dict[str, Any] = {
     "policy": "DRQN_Policy",
     "representation": "Basic_MLP",
@@ -43,8 +47,6 @@ SETTINGS: dict[str, Any] = {
     "learning_rate": 0.001,
     "gamma": 0.99,
     "start_greedy": 1.0,
-    "end_greedy": 0.05,
-    "decay_step_greedy": 100_000,
     "sync_frequency": 50,
     "training_frequency": 1,
     "start_training": 10_000,
@@ -56,8 +58,8 @@ SETTINGS: dict[str, Any] = {
     "obsnorm_range": 5,
     "rewnorm_range": 5,
 }
-"""Those of XuanCe's own file for CartPole, but exploration that lasts, and begins to learn, as long as ours. The memory
-and the replay memory are as large as ours; an update of 8 sequences follows each step of all worlds."""
+"""Those of XuanCe's own file for CartPole, but it begins to learn when ours does. Its memory and its replay memory are
+as large as ours, epsilon is that of our sub level; an update of 8 sequences follows each step of all worlds."""
 _PLACE: dict[str, Any] = {
     "agent": "DRQN",
     "env_name": "hdrqn_torchrl",
@@ -104,8 +106,48 @@ class XuanceWorlds:
         return found.last.copy(), found.reward, found.terminated, found.truncated, infos
 
 
+class Episodes(RecurrentOffPolicyBuffer):
+    """As many steps as ours has, and not as many episodes."""
+
+    def store(self, episode: EpisodeBuffer) -> None:
+        """Forgets the oldest episodes instead of steps beyond the capacity."""
+        self.memory.append(episode)
+        self.steps = getattr(self, "steps", 0) + len(episode)
+        while self.steps > CAPACITY:
+            self.steps -= len(self.memory.popleft())
+        self.size = len(self.memory)
+
+
+class Watch(BaseCallback):
+    """Looks at a training after each step: XuanCe throws episodes in progress away where one ends and goes on."""
+
+    def __init__(self, look: Callable[[], bool]) -> None:
+        super().__init__()
+        self.look = look
+
+    def on_train_step_end(self, *args, **kwargs) -> None:
+        """Ends it when it is over."""
+        if self.look():
+            raise Over
+
+
+class Over(Exception):
+    """Frames or time are used up."""
+
+
 class QuietAgent(DRQN_Agent):
-    """Without figures of its own."""
+    """Without figures of its own, and with what episodes ended in."""
+
+    def _build_memory(self, auxiliary_info_shape: Any = None) -> Episodes:
+        shown, acted = self.observation_space, self.action_space
+        sizes = {"buffer_size": CAPACITY * self.n_envs, "batch_size": self.config.batch_size}
+        lengths = {"episode_length": self.episode_length, "lookup_length": self.config.lookup_length}
+        self.atari = False
+        return Episodes(shown, acted, auxiliary_info_shape, self.n_envs, **sizes, **lengths)
+
+    def _process_observation(self, observations: Any) -> Any:
+        """A copy: XuanCe writes the first observation of the next episode over the last one of a stored one."""
+        return np.array(super()._process_observation(observations))
 
     def log_infos(self, info: dict[str, Any], x_index: int) -> None:
         """Writes nothing."""
@@ -148,11 +190,11 @@ class XuanceTraining(Training):
         env = self.make(NUM_ENVS, seed=arguments.seed)
         self.worlds = XuanceWorlds(Worlds(env, bonus=arguments.bonus), env.task.max_steps)
         place = {"env_id": arguments.id, "log_dir": folder, "model_dir": folder}
-        longest = self.worlds.max_episode_steps
-        asked = {"seed": arguments.seed, "running_steps": arguments.frames}
-        asked["buffer_size"] = CAPACITY // longest * NUM_ENVS  # that many episodes, as it counts them
+        asked: dict[str, Any] = {"seed": arguments.seed, "running_steps": arguments.frames, "buffer_size": 0}
+        epsilon = exploration_of(arguments.id)
+        asked |= {"decay_step_greedy": epsilon.frames, "end_greedy": epsilon.end}
         config = Namespace(**SETTINGS, **_PLACE, **place, **asked)
-        self.learner = QuietAgent(config, self.worlds)
+        self.learner = QuietAgent(config, self.worlds, callback=Watch(self.look))
         self.resume()
 
     @property
@@ -161,9 +203,9 @@ class XuanceTraining(Training):
         return self.learner.current_step
 
     def advance(self) -> None:
-        """Some steps, from new episodes on: XuanCe begins with an empty memory here."""
-        self.worlds.reset()
-        self.learner.train(CHUNK // NUM_ENVS)
+        """To the end."""
+        with suppress(Over):
+            self.learner.train(-(-self.arguments.frames // NUM_ENVS))
 
     def player(self, *, greedy: bool) -> Player | None:
         """It has no probabilities."""

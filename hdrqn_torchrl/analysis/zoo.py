@@ -121,16 +121,18 @@ def write_play(folder: Path, *, seed: int, allowed_targets: Sequence[str] = ()) 
     write_video(excerpt(frames, FRAMES), folder / layout.PLAY, width=WIDTH)
 
 
-def training_command(overrides: Sequence[str], *, seed: int) -> str:
+def training_command(overrides: Sequence[str], *, seed: int, total_frames: int) -> str:
     """The command that trains an agent again: of each setting the last value, without what is of the machine.
 
     Args:
         overrides: those of the run, in order.
         seed: of the run, which may be one of several that were trained together.
+        total_frames: of the run, which may have been lengthened.
 
     Examples:
-        >>> training_command(["env=gym", "tau=1", "logger=csv", "tau=2", "env.wrappers=[mine.A]", "seeds=0..3"], seed=2)
-        "hdrqn train env=gym tau=2 'env.wrappers=[mine.A]' seed=2"
+        >>> overrides = ["env=gym", "tau=1", "logger=csv", "tau=2", "env.wrappers=[mine.A]", "seeds=0..3"]
+        >>> training_command(overrides, seed=2, total_frames=50_000)
+        "hdrqn train env=gym tau=2 'env.wrappers=[mine.A]' seed=2 total_frames=50_000"
     """
     last: dict[str, str] = {}
     for override in overrides:
@@ -138,7 +140,7 @@ def training_command(overrides: Sequence[str], *, seed: int) -> str:
         last.pop(key, None)
         if not any(key.lstrip("+~") == own or key.lstrip("+~").startswith((f"{own}.", f"{own}/")) for own in _OWN):
             last[key] = override
-    last["seed"] = f"seed={seed}"
+    last |= {"seed": f"seed={seed}", "total_frames": f"total_frames={total_frames:_}"}
     return shlex.join(["hdrqn", "train", *last.values()])
 
 
@@ -171,7 +173,9 @@ def _make_card(
         name=name,
         task=str(env.get("id") or choices.get("env")),
         algo=str(choices.get("algo")),
-        command=training_command(origin.get("overrides", []), seed=agent.config.seed),
+        command=training_command(
+            origin.get("overrides", []), seed=agent.config.seed, total_frames=agent.config.total_frames
+        ),
         commit=str(origin.get("commit")),
         seed=agent.config.seed,
         frames=int(summary["frames"]),

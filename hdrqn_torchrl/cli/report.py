@@ -243,8 +243,10 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
             key = result["per_subgoal"][list(result["env"]["subgoals"]).index("key")]["attained"]
             interval = result["intervals"]["return_mean"]
             reach = f"{interval[0]:.0f} to {interval[1]:.0f}" if interval and interval[0] < interval[1] else ""
+            checkpoint = Path(result.get("checkpoint", "last")).name
+            frames = f"{run.metrics['frames'][-1] / 1000:.0f}k{'' if checkpoint == 'last' else f', {checkpoint}'}"
             cells = (
-                *(label, value_of(member.entry, "seed"), f"{run.metrics['frames'][-1] / 1000:.0f}k"),
+                *(label, value_of(member.entry, "seed"), frames),
                 *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),
                 *(f"{result['return_mean']:.0f}", reach, f"{key:.0%}"),
                 *(f"{result['success_rate']:.0%}", f"{result['steps_mean']:.0f}", f"{result['episodes']}"),

@@ -1,7 +1,10 @@
 """What agents of different makers are asked for, and how their results come together."""
 
 import json
+import subprocess
+import sys
 from math import inf
+from pathlib import Path
 
 import numpy as np
 import ours
@@ -12,6 +15,7 @@ from arguments import Arguments
 from evaluations import Evaluation, append, read, write
 from hydra import compose, initialize_config_dir
 from ours import OurArguments
+from programs import wait_until
 from run_folders import CONF
 
 from hdrqn_torchrl.cli.configuration import resolved
@@ -20,11 +24,11 @@ from hdrqn_torchrl.runs.settings.building import build_algorithm, build_env
 TASK = "MiniGrid-DoorKey-8x8-v0"
 
 
-def evaluation(frames, success, *, seed=0, agent="v3_flat", bonus=1.0, seconds=None, sampled=None):
+def evaluation(frames, success, *, seed=0, agent="v3_flat", bonus=1.0, seconds=None, sampled=None, final=True):
     return Evaluation(
         agent=agent, id=TASK, bonus=bonus, seed=seed, frames=frames, seconds=frames / 50,
         cpu_seconds=seconds or frames / 100, episodes=10, return_mean=success / 2, success_rate=success,
-        steps_mean=640 * (1 - success), sampled_success_rate=sampled,
+        steps_mean=640 * (1 - success), sampled_success_rate=sampled, final=final,
     )  # fmt: skip
 
 
@@ -86,13 +90,12 @@ class TestOurs:
         assert len(algorithm.levels) == levels
 
     @pytest.mark.parametrize("levels", [1, 2])
-    @pytest.mark.parametrize("task", ours.SETTINGS_OF_TASKS)
-    def test_settings_of_a_task_come_beside_those_of_all(self, task, levels):
+    @pytest.mark.parametrize("task", [TASK, *tasks.GRID_WORLDS, *tasks.LONG_EXPLORATION])
+    def test_exploration_is_what_others_are_told(self, task, levels):
         with initialize_config_dir(CONF, version_base="1.3"):
-            plain, own = (
-                compose("config", overrides=ours.settings_of(OurArguments(id=id, levels=levels))) for id in (TASK, task)
-            )
-        assert own.algo.sub_exploration.anneal_frames > plain.algo.sub_exploration.anneal_frames
+            config = compose("config", overrides=ours.settings_of(OurArguments(id=task, levels=levels)))
+        epsilon = config.algo.sub_exploration
+        assert tasks.exploration_of(task) == (epsilon.anneal_frames, epsilon.end)
 
     def test_a_run_folder_becomes_evaluations(self, tmp_path):
         arguments = OurArguments(id=TASK, runs=tmp_path, bonus=1.0)
@@ -108,6 +111,31 @@ class TestOurs:
         final = ours.evaluations_of(arguments)[-1]
         assert (final.frames, final.episodes, final.success_rate, final.cpu_seconds) == (80, 500, 0.75, 120.0)
         assert len(ours.evaluations_of(arguments)) == 3 and final.sampled_success_rate is None
+        assert [each.final for each in ours.evaluations_of(arguments)] == [False, False, True]
+
+    @pytest.mark.parametrize(("seconds", "over"), [(100.0, False), (99.0, True)])
+    def test_a_run_that_has_used_up_its_time_is_over_without_a_summary(self, tmp_path, seconds, over):
+        arguments = OurArguments(id=TASK, runs=tmp_path, seconds=seconds)
+        arguments.folder.mkdir()
+        columns = "frames,wall_seconds,processor_seconds,greedy/return,greedy/success,greedy/steps,greedy/episodes"
+        rows = ["0,1.5,1,0.0,0.0,640,100", "50,90.0,60,0.4,0.5,320,100", "80,150.0,99,,,,"]
+        (arguments.folder / "metrics.csv").write_text("\n".join([columns, *rows]) + "\n")
+        assert [each.final for each in ours.evaluations_of(arguments)] == [False, over]
+
+    def test_sigterm_stops_the_training_too(self, tmp_path):
+        (tmp_path / "train.py").write_text(
+            "import pathlib, signal, sys, time\n"
+            "signal.signal(signal.SIGTERM, lambda *_: (pathlib.Path('stopped').touch(), sys.exit(143)))\n"
+            "pathlib.Path('begun').touch()\ntime.sleep(60)\n"
+        )
+        peers = Path(ours.__file__).parent
+        program = f"import sys; sys.path.insert(0, {str(peers)!r}); import ours; ours.ROOT = ours.Path('.').resolve(); "
+        program += f"ours.PAUSE = 0.1; ours.train(ours.OurArguments(id={TASK!r}, runs=ours.Path('runs')))"
+        with subprocess.Popen([sys.executable, "-c", program], cwd=tmp_path) as process:
+            wait_until((tmp_path / "begun").exists, 60)
+            process.terminate()
+            assert process.wait(60) == 0
+        assert (tmp_path / "stopped").exists()
 
     @pytest.mark.parametrize("code", [0, 143, -15, 1])
     def test_a_run_that_is_stopped_is_no_error_and_one_that_fails_is(self, tmp_path, monkeypatch, code):
@@ -200,6 +228,11 @@ class TestTable:
         assert np.allclose(seconds.lines[2].get_xydata()[-1], (8, 0.2))
         assert np.allclose(seconds.lines[3].get_xydata()[-1], (8, 0.4))
         assert (results / "peers.png").stat().st_size > 0
+
+    def test_a_run_that_is_not_over_is_left_out_with_a_warning(self, results, capsys):
+        write(results / "c.jsonl", [evaluation(0, 0.0, agent="xuance_drqn", final=False)])
+        assert len(table.read_all(results)[TASK]) == 2
+        assert "left out: c.jsonl is not over" in capsys.readouterr().err
 
     def test_tables_are_written_between_their_marks(self, results, figures, monkeypatch):
         page = results / "page.md"

@@ -1,5 +1,7 @@
 """The peer sees, does and earns exactly what our agents do."""
 
+import time
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ pytest.importorskip("minigrid")
 pytest.importorskip("sb3_contrib")
 
 import recurrent_ppo
+import training
 from arguments import Arguments
 from evaluations import read
 from recurrent_ppo import PeerVecEnv, Player, RecurrentPPOTraining
@@ -146,12 +149,23 @@ class TestRun:
         RecurrentPPOTraining(asked(tmp_path, frames=64)).train()
         assert len(read(path)) == 5
 
+    def test_a_run_without_its_checkpoint_is_left_alone(self, tmp_path):
+        RecurrentPPOTraining(asked(tmp_path, frames=32)).train()
+        (path,) = tmp_path.glob("*.jsonl")
+        before = path.read_text()
+        for checkpoint in tmp_path.glob("*.zip"):
+            checkpoint.unlink()
+        RecurrentPPOTraining(asked(tmp_path, frames=32)).train()  # it is over
+        with pytest.raises(SystemExit, match="must be moved away to begin anew, got 3 evaluations"):
+            RecurrentPPOTraining(asked(tmp_path, frames=64))
+        assert path.read_text() == before
+
     def test_time_that_is_up_ends_a_run_with_the_final_evaluation(self, tmp_path, monkeypatch):
         run = RecurrentPPOTraining(asked(tmp_path, seconds=1000.0))
         learn = run.model.learn
 
         def slowly(*args, **kwargs):
-            run._cpu_started -= 600.0
+            run._cpu_began -= 600.0
             learn(*args, **kwargs)
 
         monkeypatch.setattr(run.model, "learn", slowly)
@@ -161,18 +175,19 @@ class TestRun:
 
     def test_the_second_evaluation_draws_actions_and_takes_no_time(self, tmp_path, monkeypatch):
         run = RecurrentPPOTraining(asked(tmp_path))
-        evaluate, asked_for = run.evaluate, []
+        evaluate, asked_for, now = run.evaluate, [], [time.process_time()]
+        monkeypatch.setattr(training.time, "process_time", lambda: now[0])
 
         def slowly(*, final, greedy):
             asked_for.append(greedy)
-            run._cpu_started -= 0.0 if greedy else 500.0
+            now[0] += 70.0 if greedy else 500.0
             return {**evaluate(final=final, greedy=greedy), "success_rate": 0.25 if greedy else 0.75}
 
         monkeypatch.setattr(run, "evaluate", slowly)
         run.record()
         (told,) = read(run.results)
         assert asked_for == [True, False] and (told.success_rate, told.sampled_success_rate) == (0.25, 0.75)
-        assert told.cpu_seconds < 500.0 and run.cpu_seconds < 500.0
+        assert told.cpu_seconds < 70.0 < run.cpu_seconds < 500.0  # a line has the time before its evaluation
 
     def test_drawn_actions_differ_from_the_likeliest(self, tmp_path):
         run = RecurrentPPOTraining(asked(tmp_path))

@@ -189,11 +189,12 @@ class TestScreen:
             "\n".join([f"{names},{','.join(extra)}", *(f"{r},{added}" for r in rows), ""])
         )
         (folder / "evaluations").mkdir()
-        for name, epsilon, sticky in (("a", 0.05, 0.25), ("b", 0.0, 0.0)):
+        for name, epsilon, sticky, checkpoint in (("a", 0.05, 0.25, "best"), ("b", 0.0, 0.0, "last")):
             subgoals = [{"attained": 0.0}, {"attained": 0.85}]
             env = {"subgoals": ["left_door", "key"], "sticky": sticky}
             result = {"env": env, "epsilon": epsilon, "episodes": 100, "per_subgoal": subgoals, "return_mean": 310.2}
             result |= {"intervals": {"return_mean": [290.4, 330.0]}, "success_rate": 0.75, "steps_mean": 190.0}
+            result |= {"checkpoint": checkpoint}
             (folder / f"evaluations/{name}.json").write_text(json.dumps(result))
         return folder
 
@@ -203,7 +204,7 @@ class TestScreen:
         rows = [line for line in text.splitlines() if line.startswith("| v3")]
         assert rows == [
             "| v3 | 0 | 0k | 0 | 0 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
-            "| v3 | 0 | 0k | 0.05 | 0.25 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
+            "| v3 | 0 | 0k, best | 0.05 | 0.25 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
         ]
         for name in ("montezuma", "montezuma_right", "montezuma_left", "montezuma_legs_v3"):
             assert f"(results/{name}.png)" in text and (Path("results") / f"{name}.png").stat().st_size > 100

@@ -45,7 +45,7 @@ def agents(tmp_path_factory):
 def test_a_card_says_what_an_agent_is_and_what_it_achieves(agents):
     (card,) = cards_of(agents)
     assert (card.name, card.task, card.algo, card.frames, card.episodes) == ("small-v2", "gridworld", "v2", 200, 50)
-    assert card.command == "hdrqn train env=gridworld algo=v2 seed=0" and card.commit == "abc"
+    assert card.command == "hdrqn train env=gridworld algo=v2 seed=0 total_frames=800_000" and card.commit == "abc"
     assert set(card.figures) == {"return_mean", "success_rate", "steps_mean"} == set(card.intervals)
 
 
