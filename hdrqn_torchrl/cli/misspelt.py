@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import sys
 from collections.abc import Iterator, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -18,6 +20,18 @@ from hdrqn_torchrl.runs.settings.commands import command_of
 from hdrqn_torchrl.runs.settings.comparing import flat
 
 _UNKNOWN = re.compile(r"Could not override '(.+?)'")
+
+
+@contextlib.contextmanager
+def misspelt_named(arguments: Sequence[str]) -> Iterator[None]:
+    """After Hydra has ended the program, says what :func:`misspelt` finds in its arguments."""
+    try:
+        yield
+    except SystemExit as end:
+        if end.code == 1:  # Hydra's own
+            for sentence in misspelt(arguments):
+                print(sentence, file=sys.stderr)
+        raise
 
 
 def misspelt(arguments: Sequence[str]) -> list[str]:

@@ -19,7 +19,7 @@ from hdrqn_torchrl.cli import launchers, sweeps
 from hdrqn_torchrl.cli.command_line import overrides_last, print_result, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, RunError, resolved
 from hdrqn_torchrl.cli.failures import in_words, note_error, noting_errors
-from hdrqn_torchrl.cli.misspelt import misspelt
+from hdrqn_torchrl.cli.misspelt import misspelt_named
 from hdrqn_torchrl.cli.origin import record
 from hdrqn_torchrl.cli.resuming import Plan, command, plan, with_groups_of_run
 from hdrqn_torchrl.cli.together import plans, train_together
@@ -46,13 +46,8 @@ def main() -> None:
         launchers.refuse_missing(sys.argv)
     except SettingsError as error:
         sys.exit(f"error: {error}")
-    try:
+    with misspelt_named(sys.argv[1:]):
         composed()
-    except SystemExit as end:
-        if end.code == 1:  # Hydra's own
-            for sentence in misspelt(sys.argv[1:]):
-                tell(sentence)
-        raise
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
