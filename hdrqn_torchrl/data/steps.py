@@ -24,6 +24,7 @@ class StepSelector:
         traj_key: number of the episode.
 
     Examples:
+        >>> import torch
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv
         >>> steps = MultiGoalGridEnv(num_envs=2).rollout(5, break_when_any_done=False)
         >>> steps["collector", "traj_ids"] = torch.arange(2)[:, None].expand(2, 5)
