@@ -19,8 +19,8 @@ class Evaluation:
         bonus: for each subgoal attained, in training.
         seed: of the training.
         frames: environment steps so far.
-        seconds: wall time so far, likewise.
-        cpu_seconds: processor time so far, evaluations before this one included.
+        seconds: wall time so far, evaluations before this one included.
+        cpu_seconds: processor time so far, likewise.
         episodes: number of them.
         return_mean: without the bonus.
         success_rate: share of episodes that complete the task.

@@ -19,12 +19,11 @@ from typing import Any
 
 from arguments import Arguments
 from evaluations import Evaluation, write
-from tasks import LONG_EXPLORATION, settings_of_task
+from tasks import LONG_EXPLORATION, exploration_of, settings_of_task
 
 ROOT = Path(__file__).parents[2]
 PAUSE = 1.0
 """Seconds between two looks at the time that a run has used."""
-_LONGER = ("algo.sub_exploration.anneal_frames=400_000", "algo.meta_exploration.anneal_frames=800_000")
 _STOPS = (signal.SIGTERM, signal.SIGINT)
 _WELL = (0, *(128 + stop for stop in _STOPS), *(-stop for stop in _STOPS))  # exit codes: done, stopped
 
@@ -57,7 +56,7 @@ def settings_of(arguments: OurArguments) -> list[str]:
         "algo=v3",
         f"algo.levels={arguments.levels}",
         f"algo.bonus_reward={arguments.bonus}",
-        *(_LONGER if arguments.id in LONG_EXPLORATION else ()),
+        *(longer_exploration(arguments.id) if arguments.id in LONG_EXPLORATION else ()),
         f"seed={arguments.seed}",
         f"total_frames={arguments.frames}",
         "device=cpu",
@@ -70,6 +69,12 @@ def settings_of(arguments: OurArguments) -> list[str]:
         "resume=auto",
         f"hydra.run.dir={arguments.folder}",
     ]
+
+
+def longer_exploration(id: str) -> list[str]:
+    """The meta level explores twice as long as the sub level, as in ``conf/``."""
+    frames = exploration_of(id).frames
+    return [f"algo.sub_exploration.anneal_frames={frames}", f"algo.meta_exploration.anneal_frames={2 * frames}"]
 
 
 def train(arguments: OurArguments) -> None:

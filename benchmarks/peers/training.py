@@ -32,7 +32,7 @@ class Training(ABC):
         self.results = arguments.results / f"{self.name}.jsonl"
         env = self.make(min(EVALUATION_ENVS, arguments.episodes), seed=EVALUATION_SEED)
         self.evaluation_env = TransformedEnv(env, InitTracker())
-        self._intervals = 0  # that have passed
+        self._intervals, self._is_over = 0, False  # intervals that have passed
         self._start_clock(None)
 
     def make(self, num_envs: int, seed: int | None = None) -> EnvBase:
@@ -62,9 +62,9 @@ class Training(ABC):
         Ends the program if that would leave out all of them.
         """
         lines = read(self.results)
-        if lines and lines[-1].final and self.used_up(lines[-1].frames, lines[-1].cpu_seconds):
+        self._is_over = bool(lines) and lines[-1].final and self.used_up(lines[-1].frames, lines[-1].cpu_seconds)
+        if self._is_over:
             self._start_clock(lines[-1])
-            self._is_over = True
             return
         known = [each for each in lines if each.frames <= self.frames] if self.frames else []
         if len(lines) > 1 and not known:
@@ -80,7 +80,6 @@ class Training(ABC):
         """Time goes on from that of the last evaluation."""
         began, cpu_began = (before.seconds, before.cpu_seconds) if before else (0.0, 0.0)
         self._began, self._cpu_began = time.monotonic() - began, time.process_time() - cpu_began
-        self._is_over = False
 
     @property
     def seconds(self) -> float:

@@ -109,10 +109,12 @@ class XuanceWorlds:
 class Episodes(RecurrentOffPolicyBuffer):
     """As many steps as ours has, and not as many episodes."""
 
+    steps = 0
+
     def store(self, episode: EpisodeBuffer) -> None:
         """Forgets the oldest episodes instead of steps beyond the capacity."""
         self.memory.append(episode)
-        self.steps = getattr(self, "steps", 0) + len(episode)
+        self.steps += len(episode)
         while self.steps > CAPACITY:
             self.steps -= len(self.memory.popleft())
         self.size = len(self.memory)
