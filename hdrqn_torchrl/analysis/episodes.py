@@ -14,6 +14,8 @@ from hdrqn_torchrl.envs import SubgoalSet
 from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.runs.evaluation import columns
 
+_SHARES = ("success_rate", "cut_off_rate")  # of episodes; in_order_rate is a mean of shares of goals
+
 
 def summarise(
     played: TensorDictBase,
@@ -31,11 +33,11 @@ def summarise(
         nearer: the other sets of subgoals.
 
     Returns:
-        The entries of :func:`evaluate`; ``intervals``: the same names with ``[low, high]``, of rates after Clopper and
-        Pearson, else t intervals, or ``None`` where all episodes had the same value; ``per_subgoal``: for each
-        subgoal its ``name`` if it has one, ``attained`` (share of episodes in which it was) and, for hierarchical
-        agents, ``options`` (per episode) and ``success_rate`` (share of its options that reached it; ``None`` if it
-        was never chosen); ``PREFIX_per_subgoal``: the same for each nearer set.
+        The entries of :func:`evaluate`; ``intervals``: the same names with ``[low, high]``, of shares of episodes
+        after Clopper and Pearson, else t intervals, or ``None`` where all episodes had the same value;
+        ``per_subgoal``: for each subgoal its ``name`` if it has one, ``attained`` (share of episodes in which it was)
+        and, for hierarchical agents, ``options`` (per episode) and ``success_rate`` (share of its options that reached
+        it; ``None`` if it was never chosen); ``PREFIX_per_subgoal``: the same for each nearer set.
     """
     figures = columns(played)
     result: dict[str, Any] = {name: _mean(values) for name, values in figures.items()}
@@ -62,7 +64,7 @@ def _per_subgoal(played: TensorDictBase, of: OptionKeys, names: Sequence[str]) -
 
 def _interval(name: str, values: Tensor, confidence: float) -> list[float] | None:
     sample = values.cpu().double().numpy()
-    if name.endswith("_rate"):
+    if name in _SHARES:
         return list(share_interval(sample.mean().item(), len(sample), confidence=confidence))
     low, high = mean_interval(sample, confidence=confidence)
     return None if numpy.isnan(low) else [low.item(), high.item()]

@@ -17,6 +17,7 @@ from typing import Any
 
 import yaml
 
+from hdrqn_torchrl.analysis.commits import commits_of
 from hdrqn_torchrl.analysis.episodes import summarise
 from hdrqn_torchrl.rendering import excerpt, record_episodes, write_video
 from hdrqn_torchrl.runs import Agent, load_agent, play, save_weights
@@ -176,7 +177,7 @@ def _make_card(
         command=training_command(
             origin.get("overrides", []), seed=agent.config.seed, total_frames=agent.config.total_frames
         ),
-        commit=str(origin.get("commit")),
+        commit=", ".join(commits_of(origin)),
         seed=agent.config.seed,
         frames=int(summary["frames"]),
         half=half,

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
@@ -17,20 +18,41 @@ from hdrqn_torchrl.runs.settings.run_settings import as_plain
 
 
 def record(run: Plan) -> None:
-    """Writes ``config.yaml`` and, at the beginning, ``run.json`` (where the run comes from)."""
+    """Writes ``config.yaml`` and ``run.json`` (where the run comes from, and with which other code it went on)."""
     from hdrqn_torchrl.runs.persistence.files import write_whole
 
-    if not (run.folder / layout.ORIGIN).exists():
+    path, code = run.folder / layout.ORIGIN, _code()
+    if not path.exists():
         origin = {
             "choices": run.choices,
             "overrides": list(HydraConfig.get().overrides.task),
             "command": " ".join(sys.argv),
             "init_from": None if run.weights is None else str(run.weights),
-            "commit": _commit(),
-            "versions": {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")},
+            **code,
         }
-        write_whole(run.folder / layout.ORIGIN, json.dumps(origin, indent=2) + "\n")
+        write_whole(path, json.dumps(origin, indent=2) + "\n")
+    elif went_on := _went_on(path, code):
+        write_whole(path, json.dumps(went_on, indent=2) + "\n")
     write_whole(run.folder / layout.CONFIG, OmegaConf.to_yaml(OmegaConf.create(as_plain(run.config))))
+
+
+def _code() -> dict[str, Any]:
+    """Commit and versions of what runs."""
+    versions = {name: version(name) for name in ("hdrqn_torchrl", "torch", "torchrl", "tensordict")}
+    return {"commit": _commit(), "versions": versions}
+
+
+def _went_on(path: Path, code: dict[str, Any]) -> dict[str, Any] | None:
+    """What is known of a run's origin, with the code it goes on with if that is another one."""
+    from hdrqn_torchrl.runs.persistence.files import read_json
+
+    try:
+        origin = read_json(path)
+        parts = [origin, *origin.get("resumed_with", [])]
+        last = {name: parts[-1].get(name) for name in code}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return None  # nobody needs it to go on
+    return None if last == code else origin | {"resumed_with": [*parts[1:], code]}
 
 
 def _commit() -> str | None:

@@ -4,12 +4,14 @@
     python report.py runs=outputs/studies out=docs/results.md
 
 runs      folders, glob patterns or archives (.tar.xz) that an earlier report kept, several in brackets; a run belongs
-          to a study if it has the settings of one of its jobs, wherever it lies
+          to a study if it has the settings of one of its jobs, wherever it lies. Of several runs of one job the
+          finished one that went furthest counts, of those that went as far the one in the place named last
 out       text to write; its figures go to a folder of the same name. Whatever it holds outside the
           marked parts is left as it is
 size      small (default) or paper: which of a study's two sizes
 studies   only these: studies=gridworld,views; without it there is also an overview of all claims
-keep      archive (.tar.xz) to put the runs' settings and measurements into; weights are not kept
+keep      archive (.tar.xz) to put settings and measurements of the runs of all studies into, of either size; weights
+          are not kept. If it is there already, runs must name it, too, so that none of its runs are lost
 
 The table of Montezuma's Revenge is made from what evaluate.py wrote into the run folders:
 python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_DIR/evaluations/greedy.json
@@ -25,16 +27,17 @@ from typing import Any
 from omegaconf import MISSING
 from PIL import Image
 
-from hdrqn_torchrl.analysis.archives import keep
 from hdrqn_torchrl.analysis.claims import Results
+from hdrqn_torchrl.analysis.commits import commits_of
+from hdrqn_torchrl.analysis.commits import shortened as short
 from hdrqn_torchrl.analysis.comparison import plot_curves
 from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves, estimate_finals
 from hdrqn_torchrl.analysis.figures import plot_legs_over_time
 from hdrqn_torchrl.analysis.grouping import value_of
-from hdrqn_torchrl.analysis.results import final_value
+from hdrqn_torchrl.analysis.results import AXES, final_value
 from hdrqn_torchrl.cli.command_line import as_list, command_line
-from hdrqn_torchrl.cli.entries import common_references, note
-from hdrqn_torchrl.cli.findings import Found, Runs, read_runs, runs_of_jobs
+from hdrqn_torchrl.cli.entries import common_references, note, shortened
+from hdrqn_torchrl.cli.findings import Found, Matched, Runs, check_archive, keep_runs, read_runs, runs_of_jobs
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
 from hdrqn_torchrl.runs.persistence import layout
@@ -45,11 +48,11 @@ SIZES = ("small", "paper")
 QUANTITIES = ("return", "success", "in_order", "steps")
 HEADER = (
     "| | seeds | return | 95 % interval | IQM | share of the ceiling | in order | all in order | steps | frames "
-    "| wall time | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| {time} | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 SCREEN_HEADER = (
-    "| | seed | trained frames | epsilon | sticky | score | 95 % interval | key | a door | steps | episodes "
-    "| commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| | seed | trained frames | epsilon | sticky | score | 95 % interval over episodes | key | a door | steps "
+    "| episodes | commit |\n|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 CLAIMS = "| claim (of greedy play at the end) | | measured |\n|---|---|---|"
 _NAMES = [study.name for study in STUDIES]
@@ -75,32 +78,40 @@ def run(settings: Settings) -> None:
         raise SettingsError(f"studies must be some of {', '.join(_NAMES)}, got {unknown[0]!r}.")
     if Path(settings.out).suffix.lower() != ".md":
         raise SettingsError(f"out must end in .md, got {settings.out!r}; for example out=docs/results.md.")
+    patterns = [str(each) for each in as_list(settings.runs)]
+    if settings.keep:
+        check_archive(settings.keep, patterns)
     out = Path(settings.out)
     out.with_suffix("").mkdir(parents=True, exist_ok=True)
     text = out.read_text() if out.exists() else "# Results\n"
-    used: dict[Path, Found] = {}
     overview = [CLAIMS.replace("|", "| study |", 1).replace("|---", "|---|---", 1)]
     with ExitStack() as stack:
-        runs = read_runs([str(each) for each in as_list(settings.runs)], stack)
-        everywhere = runs_of_jobs("gridworld", settings.size, runs)[0]
+        runs = read_runs(patterns, stack)
+        everywhere = runs_of_jobs("gridworld", settings.size, runs).runs
         for study in STUDIES:
             if study.name in wanted and settings.size in study.sizes:
-                found, missing = runs_of_jobs(study.name, settings.size, runs)
-                used |= {run.entry.run.folder: run for _, run in found}
-                part, claims = section(study, found, missing, everywhere, settings)
+                matched = runs_of_jobs(study.name, settings.size, runs)
+                part, claims = section(study, matched, everywhere, settings)
                 text = put(text, f"{study.name} {settings.size}", part)
                 overview += [f"| {study.title} {line}" for line in claims]
-                print(f"{study.name}: runs {len(found)}, missing {missing}")
+                print(f"{study.name}: runs {len(matched.runs)}, missing {matched.missing}")
+                tell_of_others(study, matched)
         if not settings.studies:
             text = put(text, f"claims {settings.size}", "\n".join(overview))
         if settings.keep:
-            ordered = sorted(used.values(), key=lambda run: sorted(map(str, run.settings.items())))
-            keep([run.entry.run.folder for run in ordered], Path(settings.keep))
+            keep_runs(runs, Path(settings.keep))
     out.write_text(text)
 
 
-def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings: Settings) -> tuple[str, list[str]]:
+def tell_of_others(study: Study, matched: Matched) -> None:
+    """Names runs that would stand for a job if another did not."""
+    if others := [str(run.entry.run.folder) for run in matched.passed_over]:
+        note(f"note: {study.name}: left out for runs of the same settings ({len(others)}): {shortened(others)}")
+
+
+def section(study: Study, matched: Matched, everywhere: Runs, settings: Settings) -> tuple[str, list[str]]:
     """Figure, table and claims of a study as Markdown, and the claims' lines; draws its figures."""
+    found, missing = matched.runs, matched.missing
     experiment = study.name if settings.size == "small" else f"paper/{study.name}"
     lines = [f"`python train.py -m experiment={experiment}`"]
     if left := missing + sum(not run.entry.run.summary for _, run in found):
@@ -113,9 +124,10 @@ def section(study: Study, found: Runs, missing: int, everywhere: Runs, settings:
     lines += figures(study, Path(settings.out).with_suffix("") / name, tasks)
     for title, groups in tasks:
         lines += ["", f"**{title}**"] if len(tasks) > 1 else []
-        lines += ["", SCREEN_HEADER if study.on_screen else HEADER]
+        clock = clock_of([run for members in groups.values() for run in members])
+        lines += ["", SCREEN_HEADER if study.on_screen else HEADER.format(time=AXES[clock])]
         for label, members in groups.items():
-            lines += screen_rows(label, members) if study.on_screen else [table_row(label, members)]
+            lines += screen_rows(label, members) if study.on_screen else [table_row(label, members, clock)]
     verdicts = []
     for claim in study.claims:
         for title, groups in tasks:
@@ -192,14 +204,19 @@ def finals(groups: dict[str, list[Found]]) -> Results:
     return results
 
 
-def table_row(label: str, members: list[Found]) -> str:
+def clock_of(members: list[Found]) -> str:
+    """Which time a table of runs has: that of the processor, which older runs don't tell."""
+    summaries = [each.entry.run.summary for each in members if each.entry.run.summary]
+    return "processor_seconds" if all("processor_seconds" in each for each in summaries) else "wall_seconds"
+
+
+def table_row(label: str, members: list[Found], clock: str) -> str:
     """Final results of a group as a line of a Markdown table."""
-    runs = [each.entry.run for each in members]
-    done = [run for run in runs if run.summary]
-    commits = commits_of(members)
-    seeds = ", ".join(sorted(value_of(each.entry, "seed") for each in members if each.entry.run.summary))
-    if not done:
-        return f"| {label} | none finished | | | | | | | | | | {commits} |"
+    finished = [each for each in members if each.entry.run.summary]
+    if not finished:
+        return f"| {label} | none finished | | | | | | | | | | {commits_in(members)} |"
+    done = [each.entry.run for each in finished]
+    seeds = ", ".join(sorted((value_of(each.entry, "seed") for each in finished), key=int))
     columns = [f"greedy/{name}" for name in QUANTITIES]
     mean = {name: each.value[0] for name, each in estimate_finals(done, columns).items()}
     score = estimate_finals(done, columns[:1])[columns[0]]
@@ -209,17 +226,18 @@ def table_row(label: str, members: list[Found]) -> str:
     ceiling = done[0].summary.get("ceiling")
     share = f"{mean[columns[0]] / ceiling:.0%}" if ceiling else ""
     frames = sum(run.summary["frames"] for run in done) / len(done)
-    minutes = sum(run.summary["wall_seconds"] for run in done) / len(done) / 60
+    minutes = sum(run.summary[clock] for run in done) / len(done) / 60
     cells = (
         label, seeds, f"{mean[columns[0]]:.2f}", interval, iqm, share, f"{mean[columns[2]]:.0%}",
-        f"{mean[columns[1]]:.0%}", f"{mean[columns[3]]:.1f}", f"{frames / 1000:.0f}k", f"{minutes:.0f} min", commits,
+        f"{mean[columns[1]]:.0%}", f"{mean[columns[3]]:.1f}", f"{frames / 1000:.0f}k", f"{minutes:.0f} min",
+        commits_in(finished),
     )  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
 
-def commits_of(members: list[Found]) -> str:
+def commits_in(members: list[Found]) -> str:
     """Commits of the code that made the runs."""
-    return ", ".join(sorted({str(each.origin.get("commit"))[:7] for each in members}))
+    return ", ".join(sorted({short(commit) for each in members for commit in commits_of(each.origin)}))
 
 
 def evaluations_of(folder: Path) -> list[dict[str, Any]]:
@@ -250,7 +268,7 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
                 *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),
                 *(f"{result['return_mean']:.0f}", reach, f"{key:.0%}"),
                 *(f"{result['success_rate']:.0%}", f"{result['steps_mean']:.0f}", f"{result['episodes']}"),
-                commits_of([member]),
+                commits_in([member]),
             )
             rows.append("| " + " | ".join(cells) + " |")
     return rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -217,13 +217,21 @@ def jobs_of(experiment: str) -> tuple[Job, ...]:
     return tuple(jobs)
 
 
-def is_run_of(job: Job, run: dict[str, Any]) -> bool:
+def is_run_of(job: Job, run: dict[str, Any], overridden: Collection[str] = ()) -> bool:
     """Whether a run was trained with a job's settings.
 
-    Settings newer than the run are not compared, nor those that the job leaves to the task: older runs hold these as
+    Settings newer than the run are not compared, nor those that both leave to the task: older runs hold these as
     numbers, or as ``null`` for no bound.
+
+    Args:
+        job: of a study.
+        run: the run's settings by full name.
+        overridden: names of the settings that the run's command line gave values to: it left none of these to the task.
     """
-    return all(job.settings.get(key) == value or _is_left_to_the_task(job, key, value) for key, value in run.items())
+    return all(
+        job.settings.get(key) == value or (key not in overridden and _is_left_to_the_task(job, key, value))
+        for key, value in run.items()
+    )
 
 
 def _is_left_to_the_task(job: Job, key: str, found: Any) -> bool:

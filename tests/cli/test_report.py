@@ -33,16 +33,16 @@ def composed(*overrides):
     return OmegaConf.to_yaml(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])), choices
 
 
-def make_run(folder, *overrides, score=1.0, finished=True):
+def make_run(folder, *overrides, score=1.0, finished=True, commit="0123456789", **summary):
     """A run folder as train.py writes it."""
     folder.mkdir(parents=True)
     config, choices = composed(*overrides)
     (folder / "config.yaml").write_text(config)
-    (folder / "run.json").write_text(json.dumps({"choices": choices, "commit": "0123456789"}))
+    (folder / "run.json").write_text(json.dumps({"choices": choices, "commit": commit, "overrides": overrides}))
     rows = [f"{i * 100},{i * 7},{i * 10},{i * 60.5},{score * i},{50 - i},{score * i},{i / 4},20" for i in range(5)]
     (folder / "metrics.csv").write_text("\n".join([COLUMNS, *rows]) + "\n")
     if finished:
-        summary = {"return_mean": score, "success_rate": 0.75, "in_order_rate": 0.8, "steps_mean": 21.0}
+        summary |= {"return_mean": score, "success_rate": 0.75, "in_order_rate": 0.8, "steps_mean": 21.0}
         (folder / "summary.json").write_text(json.dumps(summary | {"frames": 400, "wall_seconds": 60, "ceiling": 2.0}))
     return folder
 
@@ -153,6 +153,73 @@ def test_an_archive_gives_the_same_report(run, outputs):
 
 
 @text_only
+def test_of_equal_runs_the_one_in_the_place_named_last_counts(run, outputs, tmp_path):
+    """Whatever the places are called: an archive is unpacked to a folder that may come before or after any other."""
+    run("runs=outputs", "out=a.md", "studies=gridworld", "keep=runs.tar.xz")
+    make_run(tmp_path / "new/dqn", "experiment=gridworld", "algo=dqn", "seed=0", score=5.0)
+    for places, new in (("runs.tar.xz,new", True), ("new,runs.tar.xz", False)):
+        assert run(f"runs=[{places}]", "out=b.md", "studies=gridworld") == "gridworld: runs 7, missing 23\n"
+        assert ("| dqn | 0, 1 | 2.60 |" in Path("b.md").read_text()) == new
+
+
+def test_runs_that_are_left_out_for_others_are_named(run, outputs, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(report, "note", told.append)
+    make_run(tmp_path / "new/dqn", "experiment=gridworld", "algo=dqn", "seed=0", score=5.0)
+    run("runs=[outputs,new]", "out=a.md", "studies=gridworld")
+    assert told == ["note: gridworld: left out for runs of the same settings (1): outputs/dqn-seed0"]
+
+
+@text_only
+class TestArchive:
+    def test_it_holds_the_runs_of_all_studies_and_sizes(self, run, outputs, tmp_path):
+        make_run(tmp_path / "outputs/views", "experiment=views", "algo=v1", "env.view=3")  # others have 5
+        make_run(tmp_path / "outputs/large", "experiment=paper/gridworld", "algo=v1")
+        run("runs=outputs", "out=a.md", "studies=gridworld", "keep=runs.tar.xz")
+        assert run("runs=runs.tar.xz", "out=b.md", "studies=views") == "views: runs 5, missing 22\n"
+        large = run("runs=runs.tar.xz", "out=c.md", "studies=gridworld", "size=paper")
+        assert large == "gridworld: runs 1, missing 17\n"
+
+    def test_one_that_is_not_read_is_not_overwritten(self, run, outputs):
+        run("runs=outputs", "out=a.md", "studies=gridworld", "keep=runs.tar.xz")
+        kept = Path("runs.tar.xz").read_bytes()
+        message = run("runs=outputs", "out=a.md", "studies=gridworld", "keep=runs.tar.xz")
+        assert message.startswith("error: keep must be a new file or an archive that runs names, too")
+        assert "give 'runs=[runs.tar.xz,outputs]' or another name" in message
+        assert run("runs=[runs.tar.xz,outputs]", "out=a.md", "studies=gridworld", "keep=./runs.tar.xz").startswith(
+            "grid"
+        )
+        assert Path("runs.tar.xz").read_bytes() == kept
+
+
+@text_only
+def test_a_table_has_processor_time_where_all_runs_tell_it(run, tmp_path):
+    for seed in (2, 10):
+        make_run(
+            tmp_path / f"outputs/{seed}", "experiment=gridworld", "algo=v1", f"seed={seed % 5}", processor_seconds=180
+        )
+    run("runs=outputs", "out=a.md", "studies=gridworld")
+    text = Path("a.md").read_text()
+    assert "| frames | processor time | commit |" in text and "| 3 min | 0123456 |" in text
+    make_run(tmp_path / "outputs/older", "experiment=gridworld", "algo=v2")
+    run("runs=outputs", "out=a.md", "studies=gridworld")
+    text = Path("a.md").read_text()
+    assert "| frames | wall time | commit |" in text and "| 3 min |" not in text
+
+
+def test_seeds_stand_in_the_order_of_numbers_and_commits_are_of_runs_that_count(run, tmp_path):
+    runs = [make_run(tmp_path / f"{seed}", "experiment=gridworld", f"seed={seed}") for seed in (10, 9)]
+    runs.append(make_run(tmp_path / "going", "experiment=gridworld", "seed=1", commit="fedcba9876", finished=False))
+    origin = json.loads((runs[0] / "run.json").read_text())
+    went_on = [{"commit": "89abcdef01-dirty"}]
+    (runs[0] / "run.json").write_text(json.dumps(origin | {"resumed_with": went_on}))
+    with ExitStack() as stack:
+        members = findings.read_runs([str(tmp_path)], stack)
+    row = report.table_row("v2", members, "wall_seconds")
+    assert row.startswith("| v2 | 9, 10 |") and row.endswith("| 0123456, 89abcde-dirty |")
+
+
+@text_only
 def test_a_study_has_a_row_for_each_value_and_shows_other_agents_for_comparison(run, tmp_path):
     for algo in ("v1", "v2"):
         for length in (1, 8):
@@ -227,6 +294,7 @@ def test_runs_of_another_size_do_not_count(run, outputs):
         (["size=huge"], "error: size must be one of small, paper, got 'huge'."),
         (["studies=gridword"], "error: studies must be some of .*, got 'gridword'."),
         (["out=results.txt"], "error: out must end in .md, got 'results.txt'; "),
+        (["keep=runs.zip"], "error: keep must end in .tar.xz, got 'runs.zip'; for example keep=runs.tar.xz."),
         (["runs=broken.tar.xz"], "error: runs must name folders or readable archives, got broken.tar.xz: "),
     ],
 )
@@ -285,11 +353,11 @@ def test_the_kept_runs_still_belong_to_their_studies():
     """Settings that were renamed or left to the task since they were made must not keep them from matching."""
     with ExitStack() as stack:
         kept = findings.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
-        found, missing = findings.runs_of_jobs("gridworld", "small", kept)
-        of_authors, _ = findings.runs_of_jobs("authors_choices", "small", kept)
-    assert (len(found), missing) == (30, 0)
-    assert len({run.entry.run.folder for _, run in found}) == 30
-    assert len(of_authors) > 0
+        found = findings.runs_of_jobs("gridworld", "small", kept)
+        of_authors = findings.runs_of_jobs("authors_choices", "small", kept)
+    assert (len(found.runs), found.missing, found.passed_over) == (30, 0, [])
+    assert len({run.entry.run.folder for _, run in found.runs}) == 30
+    assert len(of_authors.runs) > 0
 
 
 def test_a_bound_that_a_job_leaves_to_the_task_is_not_compared():
@@ -300,6 +368,17 @@ def test_a_bound_that_a_job_leaves_to_the_task_is_not_compared():
     assert not is_run_of(unbounded, {"algo.sub.max_target": 1.0})
     assert is_run_of(unbounded, {"algo.sub.max_target": None})  # what it was called before
     assert not is_run_of(Job({}, {}), {"algo.sub.max_target": 1.0})
+
+
+def test_a_run_with_a_bound_of_its_own_is_another_one(tmp_path):
+    job = next(each for each in jobs_of("gridworld") if each.overrides == {"algo": "v3", "seed": "0"})
+    make_run(tmp_path / "same", "experiment=gridworld", "algo=v3")
+    make_run(tmp_path / "short", "experiment=gridworld", "algo=v3", "algo.learner.slice_len=10")
+    make_run(tmp_path / "bounded", "experiment=gridworld", "algo=v3", "algo.max_meta_target=0.5")
+    with ExitStack() as stack:
+        runs = findings.read_runs([str(tmp_path)], stack)
+    matching = [run.entry.run.folder.name for run in runs if is_run_of(job, run.settings, run.overridden)]
+    assert matching == ["same"]
 
 
 def test_an_evaluation_that_can_not_be_read_is_named_and_left_out(tmp_path, capsys):

@@ -419,6 +419,23 @@ class TestRecord:
         record(plan_for(f"resume={run}"))
         assert OmegaConf.load(run / "config.yaml").total_frames == 200
 
+    def test_other_code_that_it_goes_on_with_is_recorded(self, monkeypatch):
+        run = make_run("outputs/a/1", "total_frames=100")
+        origin_of = json.loads((run / "run.json").read_text())
+        for commit in ("89abcdef01", "89abcdef01", "fedcba9876"):
+            monkeypatch.setattr(origin, "_commit", lambda commit=commit: commit)
+            record(plan_for(f"resume={run}"))
+        after = json.loads((run / "run.json").read_text())
+        assert [each["commit"] for each in after.pop("resumed_with")] == ["89abcdef01", "fedcba9876"]
+        assert after == origin_of
+
+    def test_an_origin_that_says_nothing_does_not_keep_a_run_from_going_on(self):
+        run = make_run("outputs/a/1", "total_frames=100")
+        for content in ("[]", "{", '{"choices": {"algo": "v2"}, "resumed_with": 3}'):
+            (run / "run.json").write_text(content)
+            record(plan_for(f"resume={run}"))
+            assert (run / "run.json").read_text() == content
+
     def test_without_git_no_commit_is_recorded(self, monkeypatch):
         monkeypatch.setenv("PATH", "")
         assert origin._commit() is None

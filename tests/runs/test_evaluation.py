@@ -301,6 +301,15 @@ class TestIntervals:
         assert intervals["return_mean"] is None
         assert intervals["success_rate"] in ([0.0, pytest.approx(0.975)], [pytest.approx(0.025), 1.0])
 
+    def test_the_share_of_goals_in_order_is_a_mean_of_shares(self):
+        """Half of two goals in every episode is no coin that fell evenly."""
+        played = play(pair_env(4), always(0), episodes=8)
+        played["in_order"] = torch.full((8,), 0.5)
+        assert summarise(played)["intervals"]["in_order_rate"] is None
+        played["in_order"] = torch.tensor([0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 1.0])
+        low, high = summarise(played)["intervals"]["in_order_rate"]
+        assert (low, high) == pytest.approx((0.5 - 0.2235, 0.5 + 0.2235), abs=1e-4)  # t(7) = 2.365, s = 0.267 / sqrt 8
+
     def test_a_rate_of_0_or_1_has_an_interval(self):
         """Between walls above and below nobody who goes up (0) moves."""
         played = play(pair_env(50), always(0), episodes=100)

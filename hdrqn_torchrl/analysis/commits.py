@@ -1,0 +1,35 @@
+"""Which code a run was made with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_LENGTH = 7
+
+
+def commits_of(origin: dict[str, Any]) -> list[str]:
+    """Commits of a run, from its ``run.json``: what it began with, then what it went on with.
+
+    Args:
+        origin: what ``run.json`` holds.
+
+    Examples:
+        >>> commits_of({"commit": "0123456789", "resumed_with": [{"commit": "89abcdef01-dirty"}]})
+        ['0123456789', '89abcdef01-dirty']
+    """
+    parts = [origin, *origin.get("resumed_with", [])]
+    return list(dict.fromkeys(str(part.get("commit")) for part in parts))
+
+
+def shortened(commit: str) -> str:
+    """A commit's first digits, and whether files were changed after it.
+
+    Args:
+        commit: as ``git describe --always --dirty`` names it.
+
+    Examples:
+        >>> shortened("89abcdef01-dirty")
+        '89abcde-dirty'
+    """
+    name, dirty, _ = commit.partition("-dirty")
+    return name[:_LENGTH] + dirty
