@@ -151,6 +151,11 @@ class QuietAgent(DRQN_Agent):
         """A copy: XuanCe writes the first observation of the next episode over the last one of a stored one."""
         return np.array(super()._process_observation(observations))
 
+    @torch.no_grad()
+    def get_actions(self, *args: Any, **kwargs: Any) -> Any:
+        """Without a graph: XuanCe's would grow from the first step to the last, by 22 kB each."""
+        return super().get_actions(*args, **kwargs)
+
     def log_infos(self, info: dict[str, Any], x_index: int) -> None:
         """Writes nothing."""
 

@@ -56,6 +56,12 @@ def test_a_step_shows_what_it_led_to_and_beside_that_the_new_episode():
 
 @pytest.mark.usefixtures("tiny")
 class TestRun:
+    def test_acting_keeps_no_graph(self, tmp_path):
+        """The memory is passed from step to step to the end of the training, and its graph would be, too."""
+        run = XuanceTraining(asked(tmp_path, frames=64), str(tmp_path))
+        run.train()
+        assert not any(state.requires_grad for state in run.learner.rnn_hidden)
+
     def test_it_learns_and_what_is_learned_is_what_is_evaluated(self, tmp_path):
         run = XuanceTraining(asked(tmp_path, frames=256, bonus=1.0), str(tmp_path))
         before = [each.clone() for each in run.learner.policy.parameters()]
