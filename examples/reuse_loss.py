@@ -114,7 +114,7 @@ def main() -> None:
         buffer.extend(batch.select(*stored))
         explore.step(batch.numel())
         for _ in range(4 if len(buffer) > 1000 else 0):
-            results = loss(sample_sequences(buffer, SLICE_LEN))
+            results = loss(sample_sequences(buffer))
             optimizer.zero_grad()
             results["loss"].backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), 10.0)

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import os
-import random
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -181,38 +178,3 @@ def _set_workspace() -> None:
             f"program starts: {WORKSPACE}={_WORKSPACES[0]}."
         )
     os.environ[WORKSPACE] = _WORKSPACES[0]
-
-
-@contextmanager
-def own_random_numbers(seed: int | None = None) -> Iterator[None]:
-    """Restores the random states of torch (CPU and GPUs), numpy and Python on exit.
-
-    Args:
-        seed: seeds all of them on entry; ``None``: they keep their states.
-
-    Examples:
-        >>> before = torch.get_rng_state()
-        >>> with own_random_numbers(3):
-        ...     _ = torch.rand(5)
-        >>> torch.equal(torch.get_rng_state(), before)
-        True
-    """
-    generators = _generators()
-    states, of_python, of_numpy = [each.get_state() for each in generators], random.getstate(), numpy.random.get_state()
-    try:
-        if seed is not None:
-            for generator in generators:
-                generator.manual_seed(seed)
-            random.seed(seed)
-            numpy.random.seed(seed % 2**32)
-        yield
-    finally:
-        for generator, state in zip(generators, states, strict=True):
-            generator.set_state(state)
-        random.setstate(of_python)
-        numpy.random.set_state(of_numpy)
-
-
-def _generators() -> list[torch.Generator]:
-    """Torch's default generators, on the host and on GPUs in use: those that ``torch.manual_seed`` seeds."""
-    return [torch.default_generator, *(torch.cuda.default_generators if torch.cuda.is_initialized() else ())]

@@ -160,7 +160,7 @@ def make_recurrent_loss(
         gamma: discount of one environment step.
         largest_return: upper bound of the targets if ``settings.max_target`` is ``None``.
         smallest_return: their lower bound, unless ``settings.max_target`` is ``"unbounded"``.
-        loss_keys: keys that differ from the defaults, for :meth:`RecurrentDQNLoss.set_keys`.
+        loss_keys: keys that differ from what the network states, for :meth:`RecurrentDQNLoss.set_keys`.
         prediction_weight: weight of the error of the network's predictor, if it has one.
 
     Raises:
@@ -192,5 +192,5 @@ def make_recurrent_loss(
         predictor=network.network.predictor,
         prediction_weight=prediction_weight,
     )
-    loss.set_keys(action_value=network.action_value_key, **(loss_keys or {}))
+    loss.set_keys(**(loss_keys or {}))
     return loss

@@ -75,7 +75,6 @@ def make_drqn(
                 learner,
                 gamma=gamma,
                 largest_return=has.task.largest_return,
-                loss_keys={"action_mask": has.action_mask_key},
                 prediction_weight=prediction_weight,
             ),
             num_envs=has.num_envs,

@@ -138,12 +138,7 @@ class LevelBuilder:
                     settings,
                     gamma=self.gamma,
                     largest_return=self._rewards(0).largest_return,
-                    loss_keys={
-                        **_ends(pursued),
-                        "init": pursued.option_init,
-                        "action_mask": has.action_mask_key,
-                        "eligible": keys.ELIGIBLE if hindsight else None,
-                    },
+                    loss_keys={"eligible": keys.ELIGIBLE if hindsight else None},
                     prediction_weight=self.prediction_weight,
                 ),
                 num_envs=has.num_envs,
@@ -158,12 +153,9 @@ class LevelBuilder:
         """What trains a level that chooses subgoals: one row for each of its options."""
         level, has = self.has.levels[index], self.has
         names, max_steps = _keys_of(level), has.task.max_steps
-        ends: dict[str, NestedKey] = {"done": keys.DONE, "terminated": keys.TERMINATED, "init": keys.IS_INIT}
         largest_return, smallest_return = has.task.largest_extrinsic_return, has.task.smallest_extrinsic_return
         if level.pursues is not None:
-            above, largest_return = level.pursues.keys, self._rewards(index).largest_return
-            smallest_return = -math.inf
-            ends = {"done": above.option_done, "terminated": above.option_terminated, "init": above.option_init}
+            largest_return, smallest_return = self._rewards(index).largest_return, -math.inf
         steps, refresh = self._refresh_steps(index), None
         if steps is not None:
             refresh = partial(refresh_hidden, sub_controller, steps, read_last_observation=self.reads_last)
@@ -179,11 +171,8 @@ class LevelBuilder:
                     largest_return=largest_return,
                     smallest_return=smallest_return,
                     loss_keys={
-                        **ends,
-                        "action": names.subgoal,
                         "reward": names.option_return,
                         "steps": names.option_steps if self.smdp_discount else None,
-                        "action_mask": controller.mask_key,
                     },
                 ),
                 episode_len=None if max_steps is None else max_steps + 1,  # options, and a row that ends the episode

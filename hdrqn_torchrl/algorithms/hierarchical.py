@@ -114,7 +114,7 @@ def make_hdrqn(
         >>> list(make_hdrqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['sub', 'meta']
     """
-    _check_version(version, recurrent, meta_input, meta_input_time)
+    _check_version(version, recurrent, meta_input, meta_input_time, refresh_hidden_steps)
     meta = (meta or presets.meta_learner(version)).lasting(total_frames)
     sub, middle = sub.lasting(total_frames), (middle or meta).lasting(total_frames)
     _check_levels(levels, meta_hindsight, meta_input_time)
@@ -187,7 +187,9 @@ def make_hdrqn(
     return finding_subgoals(algorithm, has, discovery) if finds else algorithm
 
 
-def _check_version(version: str, recurrent: bool, meta_input: str, meta_input_time: str) -> None:
+def _check_version(
+    version: str, recurrent: bool, meta_input: str, meta_input_time: str, refresh_hidden_steps: int | None
+) -> None:
     if version not in ("v1", "v2"):
         raise ValueError(f"version must be 'v1' or 'v2', got {version!r}; v2 reads the state of the level below.")
     if version == "v2" and not recurrent:
@@ -203,6 +205,17 @@ def _check_version(version: str, recurrent: bool, meta_input: str, meta_input_ti
             f"meta_input_time must be 'after_last_decision' or 'after_last_observation', got {meta_input_time!r}; "
             "the paper's Algorithm 1 has the former."
         )
+    of_v2 = {
+        "meta_input": (meta_input, "hidden"),
+        "meta_input_time": (meta_input_time, "after_last_decision"),
+        "refresh_hidden_steps": (refresh_hidden_steps, None),
+    }
+    for name, (given, default) in of_v2.items():
+        if version == "v1" and given != default:
+            raise ValueError(
+                f"{name} must be left at {default!r} with version='v1', got {given!r}: its levels read the "
+                "observation, and no state of the level below; use version='v2'."
+            )
 
 
 def _check_levels(levels: int, meta_hindsight: bool, meta_input_time: str) -> None:

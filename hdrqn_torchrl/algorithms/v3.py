@@ -80,7 +80,7 @@ def make_v3(
         architecture: provides the feature extractor.
         levels: number of levels. The agent pursues the last ``levels - 1`` sets of subgoals that the task states
             (:class:`~hdrqn_torchrl.envs.Task`). 1: a flat agent with the same memory and loss, which learns from the
-            task's total reward.
+            task's total reward, discounted by ``meta_gamma``; what is about subgoals and options is not read then.
         subgoals: ``"given"``: those of the task; ``"discovered"``: the agent finds them itself, in what it sees, does
             and is paid, and reads nothing that the environment says about subgoals (docs/discovery.md).
         discovery: how it finds them.
@@ -131,6 +131,8 @@ def make_v3(
     check_learner(learner)
     if joint and meta_learning_rate is not None:
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")
+    if levels == 1 and not joint:
+        raise ValueError("joint must be True with levels=1, got False: there is no meta level; use levels=2.")
     if phase_one is not None and levels == 1:
         raise ValueError("phase_one must be None with levels=1: it is about the choice of subgoals; use levels=2.")
     if bonus_reward and levels > 1:

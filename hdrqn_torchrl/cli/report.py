@@ -41,7 +41,7 @@ from hdrqn_torchrl.cli.findings import Found, Matched, Runs, check_archive, keep
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
 from hdrqn_torchrl.runs.persistence import layout
-from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json
+from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json, write_whole
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 SIZES = ("small", "paper")
@@ -100,7 +100,7 @@ def run(settings: Settings) -> None:
             text = put(text, f"claims {settings.size}", "\n".join(overview))
         if settings.keep:
             keep_runs(runs, Path(settings.keep))
-    out.write_text(text)
+    write_whole(out, text)
 
 
 def tell_of_others(study: Study, matched: Matched) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import sys
 from collections.abc import Generator
 from dataclasses import replace
@@ -222,25 +221,24 @@ def title_of(run: Plan) -> str:
 
 def build_run(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase, Players]:
     """Everything that a run needs: trainer, evaluation environment, and what finds the scripted players' figures."""
-    import numpy
     import torch
 
     from hdrqn_torchrl.devices import set_deterministic
     from hdrqn_torchrl.envs import task_of
     from hdrqn_torchrl.envs.specs import interface_differences
+    from hdrqn_torchrl.random_numbers import seed_all
     from hdrqn_torchrl.runs.collectors.making import make_collector
     from hdrqn_torchrl.runs.evaluation import evaluate
+    from hdrqn_torchrl.runs.interruption import StopRequest
     from hdrqn_torchrl.runs.logging import RunLogger
     from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.references import Players
     from hdrqn_torchrl.runs.trainer import Trainer
 
-    config = run.config
+    config, stop = run.config, stop or StopRequest()
     device = pick_device(config.device, torch.cuda.is_available())
     set_deterministic(config.deterministic, device)
-    random.seed(config.seed)
-    numpy.random.seed(config.seed)
-    torch.manual_seed(config.seed)
+    seed_all(config.seed)
     allowed = config.allowed_targets
     env, algorithm = build_algorithm(config, {"seed": config.seed, "device": device}, allowed)
     played = {"num_envs": config.evaluation.num_envs, "device": device, **config.evaluation.env}
@@ -283,6 +281,7 @@ def build_run(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvB
             episodes=config.evaluation.episodes,
             seed=config.evaluation.seed,
             max_steps=config.evaluation.max_steps,
+            check=stop.check,
         ),
         total_frames=config.total_frames,
         log_frames=config.log_frames,

@@ -34,6 +34,7 @@ from pathlib import Path
 from hdrqn_torchrl.cli.command_line import check_place, command_line
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.runs.persistence import layout
+from hdrqn_torchrl.runs.persistence.files import write_whole
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 from hdrqn_torchrl.runs.settings.commands import as_called
 
@@ -62,6 +63,8 @@ def run(settings: Settings) -> None:
     """Does what the action says."""
     if settings.action not in ACTIONS:
         raise SettingsError(f"action must be one of {', '.join(ACTIONS)}, got {settings.action!r}.")
+    if settings.episodes is not None and settings.episodes < 1:
+        raise SettingsError(f"episodes must be >= 1, got {settings.episodes}.")
     {"list": show, "get": copy, "watch": watch, "add": add, "page": write_page}[settings.action](settings)
 
 
@@ -149,7 +152,7 @@ def write_page(settings: Settings) -> None:
     check_place(out, "out")
     cards = cards_of(zoo)
     text = out.read_text() if out.exists() else "# Agents that come trained\n\n## The agents\n"
-    out.write_text(put(text, MARK, gallery(cards, Path(os.path.relpath(zoo, out.parent)).as_posix())))
+    write_whole(out, put(text, MARK, gallery(cards, Path(os.path.relpath(zoo, out.parent)).as_posix())))
     print(f"{out}: {', '.join(card.name for card in cards)}")
 
 

@@ -18,9 +18,11 @@ class Continuity:
     Each row must go on where it ended in the last batch, in the same episode, unless that one was over or a new one
     begins. Rows of two collectors do not: what began in a world of one would end in a world of the other. And where an
     episode ends, so must its option; a time limit behind :class:`~hdrqn_torchrl.transforms.SubgoalTransform` leaves it
-    open.
+    open. Nor may a collector act without the policy, which writes its memory and what it did:
+    ``Collector(init_random_frames=...)`` begins so.
 
     Args:
+        memory_key: recurrent state of the policy ``[H]``, which goes on in each step; ``None``: it has none.
         traj_key: number of the episode.
         init_key: first step of an episode.
         option_done_key: under ``"next"``, for hierarchical agents.
@@ -39,11 +41,13 @@ class Continuity:
     def __init__(
         self,
         *,
+        memory_key: NestedKey | None = None,
         traj_key: NestedKey = keys.TRAJ_IDS,
         init_key: NestedKey = keys.IS_INIT,
         option_done_key: NestedKey = keys.OPTION_DONE,
     ) -> None:
-        self.traj_key, self.init_key, self.option_done_key = traj_key, init_key, option_done_key
+        self.memory_key, self.traj_key = memory_key, traj_key
+        self.init_key, self.option_done_key = init_key, option_done_key
         self._check = LateCheck()
         self.reset()
 
@@ -79,11 +83,27 @@ class Continuity:
             jumps = (jumps | ends[:, :-1]) & ~starts.squeeze(-1)
         option_done = batch.get("next").get(self.option_done_key, None)
         left_open = torch.zeros_like(over) if option_done is None else over & ~option_done.squeeze(-1)
-        self._check.ask((jumps | left_open).any(), partial(_refuse, jumps, left_open, episodes, ends))
+        idle = torch.zeros_like(over[0, 0]) if self._episode is not None else self._is_idle(batch, episode)
+        wrong = (jumps | left_open).any() | idle
+        self._check.ask(wrong, partial(_refuse, idle, jumps, left_open, episodes, ends))
         self._episode, self._over = episode[:, -1:].clone(), over[:, -1:].clone()
 
+    def _is_idle(self, batch: TensorDictBase, episode: Tensor) -> Tensor:
+        """Whether the policy's memory stands still in the first step of all worlds, ``[]`` bool."""
+        memory = None if self.memory_key is None else batch.get(self.memory_key, None)
+        if memory is None or episode.shape[1] < 2:
+            return torch.zeros((), dtype=torch.bool, device=episode.device)
+        goes_on = episode[:, 0] == episode[:, 1]
+        moved = (memory[:, 0] != memory[:, 1]).any(-1)
+        return goes_on.any() & ~(moved & goes_on).any()
 
-def _refuse(jumps: Tensor, left_open: Tensor, episodes: Tensor, ends: Tensor) -> None:
+
+def _refuse(idle: Tensor, jumps: Tensor, left_open: Tensor, episodes: Tensor, ends: Tensor) -> None:
+    if idle:
+        raise ValueError(
+            "the policy must act in every step, got a batch in which its memory stands still; collect without "
+            "init_random_frames: the policy's own exploration begins at random."
+        )
     if left_open.any():
         raise ValueError(
             "each end of an episode must end its option, got one that did not; a time limit must come before the "
@@ -91,15 +111,17 @@ def _refuse(jumps: Tensor, left_open: Tensor, episodes: Tensor, ends: Tensor) ->
             "them, as Collector(max_frames_per_traj=...) or as Collector(set_truncated=True)."
         )
     row, time = jumps.nonzero()[0].tolist()
+    one_collector = "give one Collector all environments instead of using several"
     if ends[row, time]:
+        between = f", and {one_collector}" if time == 0 else ""  # the last batch may have been another collector's
         raise ValueError(
             f"batch must begin a new episode where one is over, got the middle of episode "
             f"{int(episodes[row, time + 1])} after the end of episode {int(episodes[row, time])} (environment {row}, "
-            f"step {time}); collect without set_truncated=True."
+            f"step {time}); collect without set_truncated=True{between}."
         )
     raise ValueError(
         f"batch must go on where the last one ended, in every environment, got the middle of episode "
         f"{int(episodes[row, time + 1])} after a step of episode {int(episodes[row, time])}, which was not over "
         f"(environment {row}, step {time}); a learner takes the batches of one collector, all and in order: "
-        "give one Collector all environments instead of using several."
+        f"{one_collector}."
     )

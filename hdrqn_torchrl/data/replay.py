@@ -47,11 +47,13 @@ class SequenceBuffer(TensorDictReplayBuffer):
 
         Args:
             tensordicts: what is stored.
-            update_priority: not read; new sequences have the largest priority.
+            update_priority: TorchRL's; not read, as new sequences have the largest priority.
 
         Raises:
             ValueError: if they are not of the shape that the memory was built for.
         """
+        if self._transform is not None and len(self._transform):
+            tensordicts = self._transform.inv(tensordicts)
         self._storage.check_shape(tensordicts)
         written = tensordicts[..., -self._storage.rows :]
         if not on_host(next(written.values(True, True))):
@@ -240,19 +242,18 @@ def _make_sampler(
     )
 
 
-def sample_sequences(buffer: TensorDictReplayBuffer, slice_len: int) -> TensorDictBase:
-    """Draws a sample from a buffer of :func:`make_sequence_buffer` as sequences ``[batch_size, slice_len]``.
+def sample_sequences(buffer: TensorDictReplayBuffer) -> TensorDictBase:
+    """Draws sequences ``[batch_size, slice_len + lookahead]`` from a buffer of :func:`make_sequence_buffer`.
 
     Args:
         buffer: where to draw.
-        slice_len: transitions of its sequences, its lookahead included.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> buffer = make_sequence_buffer(16, slice_len=4, batch_size=3, num_envs=2)
         >>> steps = {"observation": torch.zeros(2, 5, 7), "collector": {"traj_ids": torch.tensor([[0] * 5, [1] * 5])}}
         >>> _ = buffer.extend(TensorDict(steps, [2, 5]))
-        >>> sample_sequences(buffer, 4)["observation"].shape
+        >>> sample_sequences(buffer)["observation"].shape
         torch.Size([3, 4, 7])
     """
-    return buffer.sample().reshape(-1, slice_len)
+    return buffer.sample().reshape(-1, buffer.sampler.slice_len)

@@ -15,13 +15,13 @@ from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
 from torchrl.envs.batched_envs import BatchedEnvBase
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.check_choices import check_masks, check_observation, check_shapes, check_values, random_actions
 from hdrqn_torchrl.envs.findings import Finding, ReturnError, missing, wrong
 from hdrqn_torchrl.envs.observations import ProblemOf
 from hdrqn_torchrl.envs.specs import check_is_environment
 from hdrqn_torchrl.envs.subgoals import SubgoalSet
 from hdrqn_torchrl.envs.task import Task, task_of
+from hdrqn_torchrl.random_numbers import own_random_numbers
 
 Rollout = list[TensorDictBase]  # one [N] for each step, its outcome below "next"
 _TOLERANCE = 1e-4  # of sums of rewards

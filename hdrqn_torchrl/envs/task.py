@@ -18,9 +18,9 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 from torchrl.envs.transforms import StepCounter, TransformedEnv
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.subgoals import SubgoalSet, check_flag, check_names, check_sets
 from hdrqn_torchrl.envs.symmetry import Symmetry, check_symmetries
+from hdrqn_torchrl.random_numbers import own_random_numbers
 from hdrqn_torchrl.transforms import Critic
 
 if TYPE_CHECKING:

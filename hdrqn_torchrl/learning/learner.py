@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
@@ -25,7 +25,7 @@ from hdrqn_torchrl.learning.memory import (
 )
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision
-from hdrqn_torchrl.learning.settings import LearnerSettings
+from hdrqn_torchrl.learning.settings import LearnerSettings, check_loss
 from hdrqn_torchrl.learning.stored import holds_inputs_twice
 from hdrqn_torchrl.learning.target_network import SoftTargetUpdate
 from hdrqn_torchrl.learning.update_schedule import UpdateSchedule
@@ -98,6 +98,7 @@ class Learner:
         self.network, self.settings, self.loss, self.extract, self.refresh = network, settings, loss, extract, refresh
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
+        check_loss(settings, loss)
         self.target_updater = SoftTargetUpdate(self.loss, tau=settings.tau)
         self._parameters = dict(network.named_parameters())
         self.device = next(iter(self._parameters.values())).device
@@ -134,7 +135,7 @@ class Learner:
             DeviceDraws(self.buffer, sequences=settings.batch_size, length=self._sequence_len) if draws else None
         )
         self._longer = make_longer_episodes(settings, loss, num_envs=num_envs, episode_len=episode_len)
-        self._continuity = Continuity()
+        self._continuity = Continuity(memory_key=_memory_of(network))
         self._drawn: list[TensorDictBase] = []
         self.held = False
         """Whether it only stores; updates missed meanwhile are not made up for."""
@@ -205,7 +206,7 @@ class Learner:
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
         if not self._drawn:
-            self._drawn = list(sample_sequences(self.buffer, self._sequence_len).split(self.settings.batch_size, 0))
+            self._drawn = list(sample_sequences(self.buffer).split(self.settings.batch_size, 0))
         sample = self._drawn.pop()
         return sample if self.refresh is None else self.refresh(sample)
 
@@ -335,3 +336,9 @@ class Learner:
             self.buffer.empty()
         self.schedule.warm_up_again()
         self._drawn, self._could_draw = [], False
+
+
+def _memory_of(network: TensorDictModuleBase) -> NestedKey | None:
+    """A recurrent state of a policy that goes on in each step: not of a level that decides now and then."""
+    states = getattr(network, "state_keys", [])
+    return states[0] if states and not hasattr(network, "gate_key") else None

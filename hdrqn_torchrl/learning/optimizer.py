@@ -45,6 +45,10 @@ class GroupedAdam(torch.optim.Adam):
         self._capturable = capturable
         self.set_learning_rate(learning_rate)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies: Adam's own is of groups and moments only."""
+        return super().__getstate__() | {name: getattr(self, name) for name in ("shares", "_rates", "_capturable")}
+
     def set_learning_rate(self, rate: float) -> None:
         """Sets the rate of every part."""
         for share, group, own in zip(self.shares, self.param_groups, self._rates, strict=True):

@@ -92,7 +92,7 @@ class SubController(TensorDictModuleBase):
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
         self.hidden_key, self.cell_key, self.exploration_key = hidden_key, cell_key, exploration_key
-        self.mask_key = mask_key
+        self.mask_key, self.option_keys = mask_key, option_keys
         self.writes_values = False
         """Whether acting, too, writes its Q-values; for those who watch."""
         self.in_keys = [observation_key, *(key for key in (subgoal_key, mask_key) if key is not None), init_key]
@@ -101,6 +101,21 @@ class SubController(TensorDictModuleBase):
         carried = [*self.state_keys, *self.exploration_keys]
         self.in_keys += carried
         self.out_keys = [action_key, *(keys.next_key(key) for key in carried)]
+
+    @property
+    def loss_keys(self) -> dict[str, NestedKey | None]:
+        """Where :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss` finds what this level learns from."""
+        of = self.option_keys
+        ends = {"reward": of.intrinsic_reward, "done": of.option_done, "terminated": of.option_terminated}
+        return {
+            **({} if self.subgoal_key is None else ends),
+            "action": self.action_key,
+            "action_value": self.action_value_key,
+            "action_mask": self.mask_key,
+            "init": self.init_key,
+            "observation": self.observation_key,
+            "memory": self.hidden_key,
+        }
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""
@@ -233,17 +248,34 @@ class MetaController(TensorDictModuleBase):
         self.condition_key, self.init_key = condition_key, init_key
         self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
         self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key
-        self.exploration_key = exploration_key
+        self.exploration_key, self.option_keys = exploration_key, option_keys
         self.writes_values = False
         """Whether acting, too, writes its Q-values; for those who watch."""
-        self.acting_keys = [gate_key, active_subgoal_key]
-        self.in_keys = [*self.input_keys, *(key for key in (mask_key, condition_key, init_key) if key is not None)]
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
         self._carried = carried_by(self.exploration, exploration_key)
         self.exploration_keys: list[NestedKey] = list(self._carried)
-        self.acting_keys += self.exploration_keys
-        self.in_keys += self.state_keys
+        given = [key for key in (mask_key, condition_key, init_key) if key is not None]
+        self.learning_keys = [*self.input_keys, *given, *self.state_keys]
+        """What it reads of the sequences that it learns from."""
+        self.in_keys = [gate_key, active_subgoal_key, *self.exploration_keys, *self.learning_keys]
         self.out_keys = [subgoal_key, *(keys.next_key(key) for key in (*self.state_keys, *self.exploration_keys))]
+
+    @property
+    def loss_keys(self) -> dict[str, NestedKey | None]:
+        """Where :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss` finds what this level learns from.
+
+        Below another level its sequences end where the options of that one do.
+        """
+        above = self.option_keys
+        ends = {"done": above.option_done, "terminated": above.option_terminated, "init": self.init_key}
+        return {
+            **({} if self.condition_key is None else ends),
+            "action": self.subgoal_key,
+            "action_value": self.action_value_key,
+            "action_mask": self.mask_key,
+            "reward": keys.OPTION_RETURN,
+            "steps": keys.OPTION_STEPS,
+        }
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Puts the zero LSTM state into every reset; TorchRL finds this method by itself."""

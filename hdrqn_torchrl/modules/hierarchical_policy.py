@@ -115,7 +115,6 @@ def _keys_of(controllers: Sequence[TensorDictModuleBase]) -> tuple[list[NestedKe
     read: list[NestedKey] = []
     written: list[NestedKey] = []
     for each in controllers:
-        wanted = [*getattr(each, "acting_keys", []), *each.in_keys]
-        read += [key for key in wanted if key not in written and key not in read]
+        read += [key for key in each.in_keys if key not in written and key not in read]
         written += each.out_keys
     return read, written

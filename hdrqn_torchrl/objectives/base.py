@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from typing import Literal
+from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -80,13 +80,21 @@ class SequenceLoss(LossModule):
             target = deepcopy(network)
             self._modules[f"target_{name}_params"].to_module(target, preserve_module_state=False)
         self.__dict__["_networks"] = (network, target)
+        self._registered = (f"{name}_params", f"target_{name}_params")[: 1 + delay_value]
         self.__dict__["_predictor"] = predictor  # its parameters are the network's
         self.burn_in, self.train_exact_states, self.lookahead = burn_in, train_exact_states, lookahead
-        self.double, self.loss_function, self.prediction_weight = double, loss_function, prediction_weight
+        self.double_q, self.loss_function, self.prediction_weight = double, loss_function, prediction_weight
         self.ahead: int | None = None
         """How many steps ahead the predictor is trained; ``None``: it is drawn again at every call."""
         if self._predicts:
             self.out_keys = [*self.out_keys, "prediction_loss"]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy's registered parameters are those that its networks hold: tensordicts copy theirs on their own."""
+        super().__setstate__(state)
+        for name, network in zip(self._registered, self._networks, strict=False):
+            with self._modules[name].unlock_() as registered:
+                registered.update(TensorDict.from_module(network))
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""
@@ -117,7 +125,7 @@ class SequenceLoss(LossModule):
 
     def _double_value(self, online: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
         """The value ``[*]`` of what Q-values ``[*, A]`` of both networks say, among choices that exist (``mask``)."""
-        return double_q_value(online.detach() if self.double else target, target, mask)
+        return double_q_value(online.detach() if self.double_q else target, target, mask)
 
     def _distance(self, value: Tensor, target: Tensor, mask: Tensor, weight: Tensor | None) -> Tensor:
         """Mean loss over ``mask``, all ``[B, T, *]``; sequences drawn by priority have a ``weight`` ``[B, T]``."""

@@ -84,7 +84,8 @@ class RecurrentDQNLoss(SequenceLoss):
             networks (Kapturowski et al., 2019), and from zero where ``init`` is set. None: all start from zero.
         delay_value: whether a target network is kept (update it with TorchRL's ``SoftUpdate`` or ``HardUpdate``).
 
-    Keys (``set_keys``): ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
+    Keys (``set_keys``; those that a network states in ``loss_keys``, as our controllers do, are the defaults):
+    ``action``, ``action_value``; ``reward``, ``done``, ``terminated`` (under ``"next"``);
     ``steps`` (under ``"next"``, ``None``: 1); ``init`` (restart of the state); ``mask`` (padding);
     ``action_mask`` (choices that exist, ``None``: all); ``eligible`` (steps that may enter the loss, ``None``: all;
     unlike padding they are read, and may lie anywhere); ``priority_weight`` (of sequences drawn by priority);
@@ -154,7 +155,7 @@ class RecurrentDQNLoss(SequenceLoss):
         if not 0.0 <= gamma <= 1.0:
             raise ValueError(f"gamma must lie in [0, 1], got {gamma}; the paper uses 0.99.")
         check_returns(trace_decay, n_step)
-        if unknown := {unravel_key(key) for key in state_keys} - {unravel_key(key) for key in value_network.in_keys}:
+        if unknown := {unravel_key(key) for key in state_keys} - {unravel_key(key) for key in _read_by(value_network)}:
             raise ValueError(
                 f"state_keys must be recurrent states that the network reads, got {sorted(map(str, unknown))}; a "
                 "feed-forward network has none."
@@ -177,6 +178,7 @@ class RecurrentDQNLoss(SequenceLoss):
         self.min_target, self.max_target = min_target, max_target
         self.trace_decay, self.n_step = trace_decay, n_step
         self.state_keys = list(state_keys)
+        self.set_keys(**getattr(value_network, "loss_keys", {}))
 
     @property
     def _written_states(self) -> set[NestedKey]:
@@ -189,7 +191,7 @@ class RecurrentDQNLoss(SequenceLoss):
         """What the network reads, without its recurrent states, the restart flag and the action mask."""
         network = self._networks[0]
         left_out = self._written_states | {self.tensor_keys.init, self.tensor_keys.action_mask}
-        return [key for key in network.in_keys if unravel_key(key) not in left_out]
+        return [key for key in _read_by(network) if unravel_key(key) not in left_out]
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -288,3 +290,8 @@ class RecurrentDQNLoss(SequenceLoss):
                 target = target_network(inputs.copy()).get(key)
             online = network(inputs)
         return online.get(key), target, online.get(self.tensor_keys.memory, None)
+
+
+def _read_by(network: TensorDictModuleBase) -> list[NestedKey]:
+    """What a network reads of sequences; ours may read more in acting."""
+    return getattr(network, "learning_keys", network.in_keys)

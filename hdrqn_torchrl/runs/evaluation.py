@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy
@@ -81,6 +81,7 @@ def play(
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     observers: Sequence[Observer] = (),
     max_steps: int | None = None,
+    check: Callable[[], None] = lambda: None,
 ) -> TensorDictBase:
     """Plays episodes, in rounds of one per environment.
 
@@ -102,6 +103,8 @@ def play(
         observers: are shown every step and told where it belongs to an episode that counts: environments that are done
             with theirs go on, and short episodes would be seen too often.
         max_steps: steps after which an episode is cut off if it has not ended before; needed for tasks without end.
+        check: called before each step; it may raise to cut the playing off, which leaves no trace
+            (:meth:`~hdrqn_torchrl.runs.interruption.StopRequest.check`).
 
     Returns:
         One row ``[M]`` per episode, with the entries of ``EpisodeTracker(per_subgoal=True)`` and, if ``max_steps`` is
@@ -128,7 +131,7 @@ def play(
     rounds, task = [], task_of(env)
     for number in range(-(-episodes // env.batch_size[0])):
         with isolated(env, policy, seed=seed_of_round(seed, number), exploration_type=exploration_type):
-            rounds.append(_play_once(env, policy, observers, task, max_steps))
+            rounds.append(_play_once(env, policy, observers, task, max_steps, check))
     return torch.cat(rounds, 0)  # type: ignore[return-value]
 
 
@@ -152,6 +155,7 @@ def evaluate(
     seed: int = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     max_steps: int | None = None,
+    check: Callable[[], None] = lambda: None,
 ) -> dict[str, float]:
     """Plays episodes and averages them; arguments as in :func:`play`.
 
@@ -169,7 +173,15 @@ def evaluate(
         >>> list(evaluate(agent.transform(env), agent.policy, episodes=4))
         ['return_mean', 'extrinsic_mean', 'intrinsic_mean', 'success_rate', 'in_order_rate', 'steps_mean', 'episodes']
     """
-    played = play(env, policy, episodes=episodes, seed=seed, exploration_type=exploration_type, max_steps=max_steps)
+    played = play(
+        env,
+        policy,
+        episodes=episodes,
+        seed=seed,
+        exploration_type=exploration_type,
+        max_steps=max_steps,
+        check=check,
+    )
     return {**{name: _mean(values) for name, values in columns(played).items()}, "episodes": len(played)}
 
 
@@ -179,7 +191,12 @@ def columns(played: TensorDictBase) -> dict[str, Tensor]:
 
 
 def _play_once(
-    env: EnvBase, policy: TensorDictModuleBase, observers: Sequence[Observer], task: Task, max_steps: int | None
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    observers: Sequence[Observer],
+    task: Task,
+    max_steps: int | None,
+    check: Callable[[], None],
 ) -> TensorDictBase:
     """One episode in each environment, ``[N]``."""
     tensordict, tracker = env.reset(), EpisodeTracker(task, per_subgoal=True)
@@ -187,6 +204,7 @@ def _play_once(
     episodes: TensorDictBase | None = None
     longest = max_steps or task.max_steps or LONGEST_EPISODE
     for step in range(longest):
+        check()
         if step == PATIENCE and max_steps is None and task.max_steps is None:
             _ask_for_a_limit(playing)
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -49,7 +47,6 @@ class StopRequest:
     def __init__(self) -> None:
         self._requested: int | None = None
         self._requested_at = 0.0
-        self._at_once = False
         self._depth = 0
         self._former: dict[int, object] = {}
 
@@ -77,20 +74,8 @@ class StopRequest:
                 return  # the same request: a terminal and a parent process both pass it on
             raise KeyboardInterrupt
         self._requested, self._requested_at = number, now
-        if self._at_once:
-            raise Interrupted(number)
 
     def check(self) -> None:
         """Raises :class:`Interrupted` if a stop was asked for."""
         if self._requested is not None:
             raise Interrupted(self._requested)
-
-    @contextmanager
-    def at_once(self) -> Iterator[None]:
-        """Inside, a request is answered at once: for long work that leaves no trace when it is cut off."""
-        self.check()
-        self._at_once = True
-        try:
-            yield
-        finally:
-            self._at_once = False

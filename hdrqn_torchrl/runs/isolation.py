@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from hdrqn_torchrl.devices import own_random_numbers
+from hdrqn_torchrl.random_numbers import own_random_numbers
 
 
 @contextmanager

@@ -7,6 +7,8 @@ import math
 import os
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +106,9 @@ class CSVLog:
 class RunLogger:
     """Sends each log point to the CSV file, to TorchRL loggers and to the terminal.
 
+    A logger that fails (W&B without a network) is told of and misses that point: the file has all of them, and the
+    training goes on.
+
     Args:
         folder: run folder; it is made if it is not there.
         total_frames: end of the progress bar.
@@ -161,7 +166,8 @@ class RunLogger:
         frames = int(row["frames"])
         for logger in self.loggers:
             if frames > getattr(logger, "logged_until", -1):
-                logger.log_metrics(row, step=frames)
+                with self._going_on_without(logger):
+                    logger.log_metrics(row, step=frames)
         evaluated = "greedy/return" in row
         if evaluated:
             ceiling = f" of {row['greedy/ceiling']:.2f}" if "greedy/ceiling" in row else ""
@@ -194,7 +200,8 @@ class RunLogger:
         """Its position in the files; what loggers have buffered is written, too."""
         for logger in self.loggers:
             if hasattr(logger, "flush"):
-                logger.flush()
+                with self._going_on_without(logger):
+                    logger.flush()
         return {"csv": self.csv.state_dict(), "last_greedy": self._last_greedy}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -206,7 +213,16 @@ class RunLogger:
         """Stops the progress bar and ends the loggers: what they have buffered is written."""
         self._progress.stop()
         for logger in self.loggers:
-            logger.close()
+            with self._going_on_without(logger):
+                logger.close()
+
+    @contextmanager
+    def _going_on_without(self, logger: Logger) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # whatever a service may raise
+            reason = f"{type(error).__name__}: {error}"
+            self.say(f"warning: {type(logger).__name__} failed ({reason}); {self.csv.path} has what it missed")
 
 
 def measured(row: Row) -> Row:

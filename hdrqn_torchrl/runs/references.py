@@ -12,8 +12,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from hdrqn_torchrl import __version__
-from hdrqn_torchrl.devices import own_random_numbers
 from hdrqn_torchrl.envs.task import Figures, Reference, Task
+from hdrqn_torchrl.random_numbers import own_random_numbers
 
 References = dict[str, dict[str, float]]
 LONGEST_SECONDS = 120.0

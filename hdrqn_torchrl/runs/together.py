@@ -10,15 +10,14 @@ rounding.
 
 from __future__ import annotations
 
-import random
 from collections import deque
 from collections.abc import Generator, Mapping
 from contextlib import ExitStack
 from typing import TypeVar
 
-import numpy
 import torch
 
+from hdrqn_torchrl.random_numbers import host_state, set_host_state
 from hdrqn_torchrl.runs.interruption import Interrupted
 
 Result = TypeVar("Result")
@@ -47,7 +46,7 @@ class Turn:
     """
 
     def __init__(self, kind: str) -> None:
-        self._own = _host_state()
+        self._own = host_state()
         self._outside = self._own
         self._stream: torch.cuda.Stream | None = None
         if kind == "cuda":
@@ -56,8 +55,8 @@ class Turn:
             self._generator = _of_gpu().clone_state()
 
     def __enter__(self) -> None:
-        self._outside = _host_state()
-        _set_host_state(self._own)
+        self._outside = host_state()
+        set_host_state(self._own)
         self._leave = ExitStack()
         if self._stream is not None:
             outside = _of_gpu().graphsafe_get_state()
@@ -66,25 +65,14 @@ class Turn:
             self._leave.enter_context(torch.cuda.stream(self._stream))
 
     def __exit__(self, *_: object) -> None:
-        self._own = _host_state()
-        _set_host_state(self._outside)
+        self._own = host_state()
+        set_host_state(self._outside)
         self._leave.close()
 
 
 def _of_gpu() -> torch.Generator:
     """The default generator of the GPU in use."""
     return torch.cuda.default_generators[torch.cuda.current_device()]
-
-
-def _host_state() -> tuple:
-    return torch.default_generator.get_state(), random.getstate(), numpy.random.get_state()
-
-
-def _set_host_state(state: tuple) -> None:
-    of_torch, of_python, of_numpy = state
-    torch.default_generator.set_state(of_torch)
-    random.setstate(of_python)
-    numpy.random.set_state(of_numpy)
 
 
 def finish(pieces: Pieces[Result]) -> Result:

@@ -45,7 +45,8 @@ class Trainer:
             keep its state (:class:`~hdrqn_torchrl.runs.collectors.resumable.ResumableCollector`,
             :class:`~hdrqn_torchrl.runs.collectors.workers.WorkersCollector`).
         logger: where log points go.
-        evaluate: plays greedy episodes and returns their averages (:func:`~hdrqn_torchrl.runs.evaluation.evaluate`).
+        evaluate: plays greedy episodes and returns their averages (:func:`~hdrqn_torchrl.runs.evaluation.evaluate`;
+            give it ``check=stop.check``, or Ctrl-C waits for its end).
         total_frames: environment frames to collect.
         log_frames: frames between log points.
         evaluation_frames: frames between greedy evaluations; the first comes before training.
@@ -55,6 +56,9 @@ class Trainer:
         ceiling: asked at every greedy evaluation for the return of a scripted player, which is logged next to the
             agent's; ``None`` if there is none.
         stop: asked for at safe points; several trainings of a process share one.
+
+    Raises:
+        ValueError: if there are checkpoints and the collector does not keep its state.
 
     Examples:
         >>> import tempfile
@@ -95,6 +99,11 @@ class Trainer:
         ceiling: Callable[[], float | None] = lambda: None,
         stop: StopRequest | None = None,
     ) -> None:
+        if checkpoints is not None and not hasattr(collector, "give_up"):
+            raise ValueError(
+                f"collector must keep its state where checkpoints are given, got a {type(collector).__name__}, whose "
+                "episodes in progress would be lost; use ResumableCollector, or no checkpoints."
+            )
         self.algorithm, self.collector, self.logger, self.evaluate = algorithm, collector, logger, evaluate
         self.total_frames, self.log_frames, self.evaluation_frames = total_frames, log_frames, evaluation_frames
         self.checkpoints, self.checkpoint_frames, self.ceiling = checkpoints, checkpoint_frames, ceiling
@@ -176,7 +185,8 @@ class Trainer:
                     return
                 self._incoming.check(batch, self.frames)
             except Exception as error:
-                self.collector.give_up(self.frames)
+                if hasattr(self.collector, "give_up"):  # others are not saved
+                    self.collector.give_up(self.frames)
                 self._saving.save_after(error, self.frames, given_up=True)
                 raise
             yield batch
@@ -242,8 +252,7 @@ class Trainer:
             row |= monitor.metrics()
         best = False
         if evaluation:
-            with self._stop.at_once():
-                result = self.evaluate()
+            result = self.evaluate()
             row |= {
                 f"greedy/{name.removesuffix('_mean').removesuffix('_rate')}": value for name, value in result.items()
             }
@@ -306,6 +315,7 @@ class Trainer:
             **self.clock.state_dict(),
             "tracker": self._tracker.state_dict(),
             "window": self._interval.state_dict(),
+            "unattained": self._unattained.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -320,3 +330,5 @@ class Trainer:
         self.clock.load_state_dict(state)
         self._tracker.load_state_dict(state["tracker"])
         self._interval.load_state_dict(state["window"])
+        if "unattained" in state:  # earlier checkpoints have none
+            self._unattained.load_state_dict(state["unattained"])

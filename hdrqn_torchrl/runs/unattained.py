@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -69,3 +70,13 @@ class UnattainedSubgoals:
                 stacklevel=2,
             )
         self._sets = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was seen, unless it has been told."""
+        return {"seen": list(self._seen), "episodes": int(self._episodes), "told": not self._sets}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` returned."""
+        self._seen, self._episodes = list(state["seen"]), state["episodes"]
+        if state["told"]:
+            self._sets = ()

@@ -456,6 +456,9 @@ class TestOptions:
                 "recurrent must be True with version='v2', got False.*; ",
             ),
             (make_hdrqn, {"meta_input": "all"}, "meta_input must be one of .*, got 'all'; "),
+            (make_hdrqn, {"version": "v1", "meta_input": "cell"}, "meta_input must be left at 'hidden' with .*'cell'"),
+            (make_hdrqn, {"version": "v1", "refresh_hidden_steps": 5}, "refresh_hidden_steps must be left at None"),
+            (make_v3, {"levels": 1, "joint": False}, "joint must be True with levels=1, got False: there is no meta"),
             (make_hdrqn, {"meta_input_time": "never"}, "meta_input_time must be .*, got 'never'; "),
             (make_hdqn, {"gamma": 2.0}, r"gamma must lie in \[0, 1\], got 2.0; "),
         ],
@@ -659,7 +662,7 @@ class TestV3:
 
     def test_double_reaches_the_loss(self):
         for double in (True, False):
-            assert self.make(learner={"double": double}).learners["joint"].loss.double == double
+            assert self.make(learner={"double": double}).learners["joint"].loss.double_q == double
 
     def test_options_reach_the_network(self):
         algorithm = self.make(memory_size=9, head_size=7, joint=False)
@@ -710,7 +713,7 @@ class TestV3:
             settings = {"slice_len": 8, "batch_size": 512, "num_envs": 8, "sampling": sampling}
             buffer = make_sequence_buffer(2_000, **settings)
             buffer.extend(learner.extract(batch))
-            sample = sample_sequences(buffer, 8)
+            sample = sample_sequences(buffer)
             if sampling == "episode_starts":
                 sample["collector", "mask"] = sample["is_init"].squeeze(-1).cumsum(-1) == 1
             rows = {row["collector", "traj_ids"][0, 0].item(): row for row in sample.split(1)}
@@ -730,7 +733,7 @@ class TestV3:
             self.make(meta_learning_rate=0.1)
 
     def test_learner_settings_reach_the_loss(self):
-        changes = {"burn_in": 0.25, "loss_function": "smooth_l1", "double": False}
+        changes = {"burn_in": 0.25, "loss_function": "smooth_l1"}
         loss = self.make(learner=changes).learners["joint"].loss
         assert {name: getattr(loss, name) for name in changes} == changes
         loss = self.make(learner={"burn_in": 0.0, "train_exact_states": False}).learners["joint"].loss

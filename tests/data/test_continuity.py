@@ -182,3 +182,15 @@ def seen_by(make_transforms):
 
 def make_collector_of(env, algorithm, **settings):
     return Collector(env, algorithm.policy, frames_per_batch=32, auto_register_policy_transforms=False, **settings)
+
+
+@pytest.mark.parametrize("name", ["drqn", "v1", "v2", "v3"])
+def test_steps_that_the_policy_did_not_take_are_refused(name):
+    """Its memory, and what it did, would be stored as if nothing had happened."""
+    env = small_env(4)
+    algorithm = build(name, env)
+    sizes = {"frames_per_batch": 32, "total_frames": 64, "init_random_frames": 32}
+    collector = Collector(algorithm.transform(env), algorithm.policy, **sizes, auto_register_policy_transforms=False)
+    with pytest.raises(ValueError, match=r"policy must act in every step.* without init_random_frames"):
+        algorithm.observe(next(iter(collector)))
+    collector.shutdown()

@@ -47,7 +47,7 @@ def test_sequences_are_those_of_the_sampler_and_as_frequent(sampling, steps, ter
     """By the chi-squared statistic of both counts, which has about as many degrees of freedom as there are starts."""
     buffer, draws, _ = make(sampling, steps, terminated=terminated and sampling != "episode_starts")
     draws.refresh()
-    (expected, theirs), (found, ours) = counted(lambda: sample_sequences(buffer, 4)), counted(draws.draw)
+    (expected, theirs), (found, ours) = counted(lambda: sample_sequences(buffer)), counted(draws.draw)
     assert found.keys() == expected.keys() and len(found) > 3
     for start, row in ours.items():
         other = theirs[start]
@@ -61,7 +61,7 @@ def test_sequences_are_those_of_the_sampler_and_as_frequent(sampling, steps, ter
 def test_draws_of_episodes_with_lookahead_are_as_frequent_as_the_samplers():
     buffer, draws, _ = make("episodes", 35, slice_len=2, lookahead=2)
     draws.refresh()
-    (expected, _), (found, _) = counted(lambda: sample_sequences(buffer, 4)), counted(draws.draw)
+    (expected, _), (found, _) = counted(lambda: sample_sequences(buffer)), counted(draws.draw)
     assert found.keys() == expected.keys()
     assert max(abs(found[each] / expected[each] - 1) for each in found if expected[each] > 300) < 0.4
 

@@ -78,7 +78,7 @@ class World:
         return found
 
     def sample(self):
-        return sample_sequences(self.buffer, self.slice_len)
+        return sample_sequences(self.buffer)
 
     def set_priorities(self, priority_of):
         """Draws until every complete start was drawn, and sets its priority."""
@@ -158,7 +158,7 @@ def test_a_capacity_that_is_not_a_multiple_of_num_envs_is_rounded_up():
     buffer = make_sequence_buffer(64, slice_len=2, batch_size=512, num_envs=3, sampling="steps", priority_exponent=1.0)
     for _ in range(12):
         buffer.extend(world.take(4))
-    sample = sample_sequences(buffer, 2)
+    sample = sample_sequences(buffer)
     assert len(set(starts_of(sample))) == len(buffer) == 66
     buffer.update_priority(sample["index"][:, 0], torch.rand(512))
 
@@ -225,7 +225,7 @@ class TestRows:
         buffer = make_sequence_buffer(20, **settings)
         for number in range(40):
             buffer.extend(self.episode(number, 1 + number % 4))
-            sample = sample_sequences(buffer, 3)
+            sample = sample_sequences(buffer)
             episode, step, real = sample["collector", "traj_ids"], sample["step"], sample["collector", "mask"]
             assert (episode == episode[:, :1]).all()
             left = 1 + episode[:, 0] % 4 - step[:, 0]
@@ -233,7 +233,7 @@ class TestRows:
             assert sampling == "steps" or (step[:, 0] == 0).all()
         rows = sample["index"][:, 0]
         buffer.update_priority(rows, (step[:, 0] == 0) * 1.0)
-        assert (sample_sequences(buffer, 3)["step"][:, 0] == 0).float().mean() > 0.9
+        assert (sample_sequences(buffer)["step"][:, 0] == 0).float().mean() > 0.9
 
 
 class TestState:

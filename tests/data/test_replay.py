@@ -3,7 +3,9 @@ from functools import partial
 import pytest
 import torch
 from streams import Stream, check_sequences, one_episode
+from tensordict import TensorDict
 from torchrl.data import SliceSampler
+from torchrl.envs import Transform
 
 from hdrqn_torchrl.data import (
     EpisodeSliceSampler,
@@ -30,7 +32,7 @@ class TestSequencesOfSteps:
         stream, full = Stream(num_envs), 0
         for _ in range(180 // length):
             buffer.extend(stream.take(length))
-            sequences = sample_sequences(buffer, slice_len)
+            sequences = sample_sequences(buffer)
             assert len(sequences) == 16
             check_sequences(sequences, slice_len, newest=set(zip(stream.episode, stream.step, strict=True)))
             full += len(buffer) == capacity
@@ -44,7 +46,7 @@ class TestSequencesOfSteps:
         buffer.extend(stored)
         seen = set()
         for _ in range(60):
-            sequences = sample_sequences(buffer, 4)
+            sequences = sample_sequences(buffer)
             pairs = torch.stack([sequences["collector", "traj_ids"], sequences["step"]], -1)
             seen |= {tuple(pair) for pair in pairs.flatten(0, 1).tolist()}
         pairs = torch.stack([stored["collector", "traj_ids"], stored["step"]], -1).flatten(0, 1).tolist()
@@ -54,7 +56,7 @@ class TestSequencesOfSteps:
     def test_trajectories_shorter_than_the_slice_are_padded_not_dropped(self, sampling):
         buffer, stream = make_sequence_buffer(90, slice_len=30, batch_size=8, num_envs=3, sampling=sampling), Stream(3)
         buffer.extend(stream.take(30))
-        sequences = sample_sequences(buffer, 30)
+        sequences = sample_sequences(buffer)
         check_sequences(sequences, 30, newest=set(zip(stream.episode, stream.step, strict=True)))
         assert not sequences["collector", "mask"].all(-1).any()
 
@@ -66,7 +68,7 @@ def test_sequences_of_options_are_drawn_from_rows_of_whole_episodes(sampling):
     for episode in range(60):
         length = 1 + episode % 3  # one to three options, far fewer than the slice
         buffer.extend(one_episode(episode, length))
-        sequences = sample_sequences(buffer, 8)
+        sequences = sample_sequences(buffer)
         check_sequences(sequences, 8, newest=set())
         assert (sequences["collector", "mask"].sum(-1) <= 3).all()
     assert len(buffer) == 40
@@ -77,7 +79,7 @@ def start_counts(sampling):
     torch.manual_seed(0)
     buffer = make_sequence_buffer(10, slice_len=2, batch_size=2_000, sampling=sampling)
     buffer.extend(torch.cat([one_episode(0, 2), one_episode(1, 8)]))
-    starts = sample_sequences(buffer, 2)[:, 0]
+    starts = sample_sequences(buffer)[:, 0]
     return (starts["collector", "traj_ids"] * 2 + starts["step"]).bincount(minlength=10) / len(starts)
 
 
@@ -107,7 +109,7 @@ class TestRandomEpisodes:
         for sampler in (torchrls, None):
             buffer = self.fill(sampler, 3, batches)
             torch.manual_seed(0)
-            drawn.append(sample_sequences(buffer, 4).select("step", ("collector", "traj_ids"), ("collector", "mask")))
+            drawn.append(sample_sequences(buffer).select("step", ("collector", "traj_ids"), ("collector", "mask")))
         assert (drawn[0] == drawn[1]).all()
 
     def test_where_slices_begin_does_not_depend_on_the_lookahead(self):
@@ -118,7 +120,7 @@ class TestRandomEpisodes:
                 60, slice_len=3, batch_size=400, num_envs=3, sampling="episodes", lookahead=lookahead
             )
             buffer.extend(Stream(3).take(20))
-            sequences = sample_sequences(buffer, 3 + lookahead)
+            sequences = sample_sequences(buffer)
             starts.append(sequences[:, 0].select("step", ("collector", "traj_ids")))
         assert (starts[0] == starts[1]).all()
         check_sequences(sequences, 6, newest=set(zip(*last_steps(buffer), strict=True)))
@@ -135,7 +137,7 @@ class TestWholeEpisodes:
         torch.manual_seed(0)
         buffer = make_sequence_buffer(10, slice_len=4, batch_size=3_000, sampling="whole_episodes")
         buffer.extend(torch.cat([one_episode(0, 2), one_episode(1, 7), one_episode(2, 1)]))
-        sequences = sample_sequences(buffer, 4)
+        sequences = sample_sequences(buffer)
         assert (sequences["step"][:, 0] == 0).all()
         episode, real = sequences["collector", "traj_ids"][:, 0], sequences["collector", "mask"].sum(-1)
         assert (real == torch.tensor([2, 4, 1])[episode]).all()
@@ -153,14 +155,14 @@ class TestWholeEpisodes:
             stored = buffer.storage[:]
             oldest = stored[(buffer.storage._last_cursor_index + 1) % len(stored)]
             beheaded += (oldest["step"] > 0).sum().item()
-            assert (sample_sequences(buffer, 3)["step"][:, 0] == 0).all()
+            assert (sample_sequences(buffer)["step"][:, 0] == 0).all()
         assert beheaded > 10
 
     def test_without_any_start_of_an_episode_an_error_says_what_to_do(self):
         buffer = make_sequence_buffer(4, slice_len=2, batch_size=2, sampling="whole_episodes")
         buffer.extend(one_episode(0, 6)[2:])
         with pytest.raises(RuntimeError, match="raise capacity above the length of an episode"):
-            sample_sequences(buffer, 2)
+            sample_sequences(buffer)
 
 
 def test_sequences_are_on_the_device_of_the_storage():
@@ -245,10 +247,10 @@ def test_whether_a_sequence_can_be_drawn_is_known_before_it_is(sampling, exponen
         buffer.extend(stream.take(1))
         able.append(buffer.can_sample())
         if able[-1]:
-            sample_sequences(buffer, 5)
+            sample_sequences(buffer)
         else:
             with pytest.raises(RuntimeError, match=r"no stored (start|episode|step)"):
-                sample_sequences(buffer, 5)
+                sample_sequences(buffer)
     if sampling == "episode_starts":
         assert 5 < sum(able) < 38
 
@@ -267,7 +269,7 @@ class TestState:
         for _ in range(batches):
             first.extend(stream.take(6))
         if batches > 2:
-            sample_sequences(first, 4)
+            sample_sequences(first)
         second.load_state_dict(first.state_dict())
         for _ in range(6):
             if batches > 2 or len(first) > 40:
@@ -275,7 +277,7 @@ class TestState:
                 drawn = []
                 for buffer in (first, second):
                     torch.manual_seed(batches)
-                    drawn.append(sample_sequences(buffer, 4))
+                    drawn.append(sample_sequences(buffer))
                 assert (drawn[0] == drawn[1]).all()
                 if sampling != "episode_starts":
                     check_sequences(drawn[1], 4, newest=set(zip(stream.episode, stream.step, strict=True)))
@@ -298,7 +300,7 @@ def test_the_state_of_an_empty_memory_is_restored():
     assert len(second) == 0
     batch = Stream(3).take(8)
     second.extend(batch)
-    assert len(second) == 24 and sample_sequences(second, 4).shape == (4, 4)
+    assert len(second) == 24 and sample_sequences(second).shape == (4, 4)
 
 
 def test_the_state_of_a_memory_of_options_is_restored():
@@ -310,7 +312,7 @@ def test_the_state_of_a_memory_of_options_is_restored():
         drawn = []
         for buffer in (first, second):
             torch.manual_seed(number)
-            drawn.append(sample_sequences(buffer, 3))
+            drawn.append(sample_sequences(buffer))
             buffer.extend(one_episode(number, 1 + number % 3))
         assert (drawn[0] == drawn[1]).all()
 
@@ -359,7 +361,7 @@ class Recorder:
         return {(env, time) for env, time in self.starts if oldest <= time <= last}
 
     def sample(self):
-        return sample_sequences(self.buffer, self.slice_len)
+        return sample_sequences(self.buffer)
 
 
 class TestEpisodeStarts:
@@ -448,14 +450,14 @@ def test_loading_a_memory_clears_the_caches_of_its_sampler(sampling):
     source, target = (make_sequence_buffer(40, **settings) for _ in range(2))
     stream = Stream(2)
     target.extend(stream.take(20))
-    sample_sequences(target, 4)
+    sample_sequences(target)
     for _ in range(2):
         source.extend(stream.take(13))
     target.load_state_dict(source.state_dict())
     drawn = []
     for buffer in (source, target):
         torch.manual_seed(0)
-        drawn.append(sample_sequences(buffer, 4))
+        drawn.append(sample_sequences(buffer))
     assert (drawn[0] == drawn[1]).all()
 
 
@@ -470,3 +472,31 @@ def test_loading_a_memory_clears_the_caches_of_its_sampler(sampling):
 def test_samplers_refuse_lengths_that_make_no_sense(kind, settings, message):
     with pytest.raises(ValueError, match=message):
         kind(**settings)
+
+
+def test_transforms_change_what_is_stored_and_what_is_drawn():
+    """As in TorchRL's buffers: bytes in the memory, numbers from 0 to 1 outside."""
+
+    class Bytes(Transform):
+        def _inv_call(self, tensordict):
+            return tensordict.set("value", (tensordict["value"] * 255).round().byte())
+
+        def forward(self, tensordict):
+            return tensordict.set("value", tensordict["value"].float() / 255)
+
+    buffer = make_sequence_buffer(16, slice_len=4, batch_size=3, num_envs=2)
+    buffer.append_transform(Bytes())
+    steps = {"value": torch.full((2, 5, 1), 0.6), "collector": {"traj_ids": torch.tensor([[0] * 5, [1] * 5])}}
+    buffer.extend(TensorDict(steps, [2, 5]))
+    assert buffer[:]["value"].dtype == torch.float32 and buffer._storage[:]["value"].dtype == torch.uint8
+    assert (sample_sequences(buffer)["value"] == 0.6).all()
+
+
+def test_sequences_have_the_length_that_the_buffer_draws():
+    buffer = make_sequence_buffer(40, slice_len=4, batch_size=3, num_envs=2, lookahead=2)
+    steps = {"step": torch.arange(10).expand(2, 10), "collector": {"traj_ids": torch.arange(2)[:, None].expand(2, 10)}}
+    buffer.extend(TensorDict(steps, [2, 10]))
+    for _ in range(20):
+        drawn = sample_sequences(buffer)
+        real = drawn["collector", "mask"].squeeze(-1)
+        assert drawn.shape == (3, 6) and drawn["step"].diff(dim=1)[real[:, 1:]].eq(1).all()

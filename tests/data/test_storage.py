@@ -34,7 +34,7 @@ def drawn(buffer, seed):
     torch.manual_seed(seed)
     if not buffer.can_sample():
         return None
-    sample = sample_sequences(buffer, 4)
+    sample = sample_sequences(buffer)
     if "priority_weight" in sample:
         buffer.update_priority(sample["index"][:, 0], torch.rand(len(sample)))
     return sample

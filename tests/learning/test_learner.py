@@ -11,6 +11,7 @@ from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.learning import learner as learner_module
 from hdrqn_torchrl.learning.finite import NonFiniteError
 from hdrqn_torchrl.modules import FullyConnectedFeatures, QNetwork, SubController, paper_network
+from hdrqn_torchrl.objectives import RecurrentDQNLoss
 from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 
 
@@ -787,3 +788,57 @@ class TestPrecision:
         second = self.chosen(monkeypatch, "bf16", precision="auto")
         second.load_state_dict(state)
         assert second.precision == "fp32"
+
+
+@pytest.mark.parametrize(
+    ("settings", "loss", "message"),
+    [
+        ({"n_step": 3}, {}, "n_step must be that of the loss, which has 1, got 3"),
+        ({"double": False}, {}, "double must be that of the loss, which has True, got False"),
+        ({"max_target": 2.0}, {"max_target": 1.0}, "max_target must be that of the loss, which has 1.0, got 2.0"),
+        ({"stored_state": True}, {}, "stored_state must be that of the loss, which has False, got True"),
+        ({"burn_in": 0.25}, {}, "burn_in must be that of the loss, which has 0.5, got 0.25"),
+        ({"burn_in": 0.25, "n_step": 3, "double": False}, {"burn_in": 0.25, "n_step": 3, "double": False}, None),
+        ({}, {"n_step": 3, "burn_in": 0.0}, None),  # a loss may have its own
+    ],
+)
+def test_a_loss_that_was_built_with_other_settings_is_refused(settings, loss, message):
+    """It would learn by its own, and the settings would say something else."""
+    controller = SubController(
+        QNetwork(FullyConnectedFeatures(3, (8,)), num_actions=2, hidden_size=6), subgoal_key=None, init_key="is_init"
+    )
+
+    def make():
+        return Learner(
+            controller,
+            tiny_settings(**settings),
+            extract=lambda batch: batch,
+            loss=RecurrentDQNLoss(controller, lookahead=1 + 2 * (loss.get("n_step", 1) > 1), **loss),
+            num_envs=2,
+        )
+
+    if message is None:
+        make()
+    else:
+        with pytest.raises(ValueError, match=f"settings.{message}; build it with make_recurrent_loss"):
+            make()
+
+
+@pytest.mark.parametrize("name", ["v2", "v3", "drqn"])
+def test_a_copy_of_an_agent_learns_as_the_agent_does(name):
+    """Networks, what losses register, target networks and optimisers belong together in the copy, too."""
+    env = small_env(4)
+    algorithm = build(name, env)
+    batches = collect(algorithm, env, 30, batches=3)
+    for batch in batches:
+        algorithm.observe(batch)
+    copy, reports = deepcopy(algorithm), []
+    for each in (algorithm, copy):
+        torch.manual_seed(0)
+        before = deepcopy(dict(each.policy.named_parameters()))
+        losses = [learner.learn()["loss"] for _ in range(3) for learner in each.learners.values()]
+        assert any(not torch.equal(before[key], value) for key, value in each.policy.named_parameters())
+        reports.append(torch.stack(losses))
+    assert torch.equal(*reports) and len(reports[0].unique()) > 1
+    for (key, one), other in zip(algorithm.policy.named_parameters(), copy.policy.parameters(), strict=True):
+        assert torch.equal(one, other) and one is not other, key

@@ -2,6 +2,7 @@ import pytest
 import torch
 from helpers import build, collect, options_of, small_env, tiny_settings
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.collectors import MultiSyncCollector
 from torchrl.envs import ExplorationType, TransformedEnv, set_exploration_type
 from torchrl.modules import set_recurrent_mode
@@ -36,6 +37,14 @@ def root(rows=3, **entries):
     td["option_init"] = torch.zeros(rows, 1, dtype=torch.bool)
     td["subgoal_mask"] = torch.ones(rows, 3, dtype=torch.bool)
     return td.update(entries)
+
+
+def test_controllers_state_all_that_they_read():
+    meta, sub = MetaController(make_network()), SubController(make_network(num_conditions=3))
+    chain = TensorDictSequential(meta, sub)
+    read = root().exclude("subgoal").select(*chain.in_keys)
+    assert {"active_subgoal", "option_init", "subgoal_mask"} <= set(chain.in_keys) and "subgoal" not in chain.in_keys
+    assert (chain(read)["subgoal"] == 0).all()  # no option starts: the choice is kept
 
 
 class TestSubController:

@@ -764,3 +764,25 @@ def test_targets_count_on_no_action_that_cannot_be_chosen(settings, wanted):
     for key in ("is_init", ("next", "done"), ("next", "terminated")):
         sample[key] = torch.zeros(1, 3, 1, dtype=torch.bool)
     assert loss(sample)["target"].item() == pytest.approx(sum(wanted) / len(wanted))
+
+
+@pytest.mark.parametrize(("level", "expected"), [("flat", {}), ("sub", SUB_KEYS), ("meta", META_KEYS)])
+def test_a_loss_finds_what_its_controller_learns_from(level, expected):
+    """Nobody has to know that a sub level is paid otherwise, and has other ends, than the task has."""
+    found = RecurrentDQNLoss(make_controller(level)).tensor_keys
+    for name, key in expected.items():
+        assert getattr(found, name) == key, name
+    others = RecurrentDQNLoss.default_keys()
+    for name in set(SUB_KEYS | META_KEYS) - set(expected):
+        assert getattr(found, name) == getattr(others, name), name
+
+
+def test_choices_that_are_masked_in_acting_are_masked_in_targets():
+    network = QNetwork(FullyConnectedFeatures(SIZE, (7,)), num_actions=ACTIONS, hidden_size=6)
+    controller = SubController(network, subgoal_key=None, init_key="is_init", mask_key="allowed")
+    assert RecurrentDQNLoss(controller).tensor_keys.action_mask == "allowed"
+
+
+def test_a_loss_can_be_made_of_doubles():
+    loss = RecurrentDQNLoss(make_controller().float()).double()
+    assert {each.dtype for each in loss.parameters()} == {torch.float64}

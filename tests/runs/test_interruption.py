@@ -33,29 +33,6 @@ class TestOneSignal:
                 signal.raise_signal(number)
         assert not isinstance(reason.value, Interrupted)
 
-    def test_a_stop_signal_during_long_work_is_answered_at_once(self, number, name, code):
-        with StopRequest() as stop:
-            with pytest.raises(Interrupted), stop.at_once():
-                signal.raise_signal(number)
-                raise AssertionError("it went on")
-            with pytest.raises(Interrupted):
-                stop.check()  # still asked for
-
-    def test_long_work_does_not_begin_after_a_stop_signal(self, number, name, code):
-        with StopRequest() as stop:
-            signal.raise_signal(number)
-            with pytest.raises(Interrupted), stop.at_once():
-                raise AssertionError("it began")
-
-
-def test_a_stop_signal_after_long_work_waits_again():
-    with StopRequest() as stop:
-        with stop.at_once():
-            pass
-        signal.raise_signal(signal.SIGTERM)
-        with pytest.raises(Interrupted):
-            stop.check()
-
 
 def test_a_new_request_forgets_the_last_one():
     stop = StopRequest()

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.envs import ExplorationType
 from torchrl.envs.utils import exploration_type
 
-from hdrqn_torchrl.devices import own_random_numbers
+from hdrqn_torchrl.random_numbers import own_random_numbers
 from hdrqn_torchrl.rendering import record_episodes
 from hdrqn_torchrl.runs.evaluation import evaluate
 from hdrqn_torchrl.runs.isolation import isolated

@@ -166,6 +166,34 @@ class TestRunLogger:
         for fake in loggers:
             assert fake.rows == [(ROW, 1_000)] and fake.closed
 
+    def test_a_logger_that_fails_costs_no_more_than_its_own_point(self, tmp_path):
+        class Failing:
+            def __init__(self):
+                self.got = []
+
+            def log_metrics(self, row, step):
+                if step == 2:
+                    raise ConnectionError("no network")
+                self.got.append(step)
+
+            def flush(self):
+                raise ConnectionError("still none")
+
+            def close(self):
+                raise ConnectionError("none at all")
+
+        failing, console = Failing(), Console(file=io.StringIO())
+        logger = RunLogger(tmp_path, total_frames=3, loggers=[failing], console=console)
+        for frames in (1, 2, 3):
+            logger.log({"frames": frames})
+        logger.state_dict()
+        logger.close()
+        assert failing.got == [1, 3]
+        assert (tmp_path / "metrics.csv").read_text().split() == ["frames", "1", "2", "3"]
+        told = console.file.getvalue()
+        assert f"warning: Failing failed (ConnectionError: no network); {tmp_path / 'metrics.csv'} has what" in told
+        assert "still none" in told and "none at all" in told
+
     def test_without_a_terminal_each_greedy_evaluation_prints_one_line(self, tmp_path):
         logger, console = run_logger(tmp_path)
         logger.log(ROW)

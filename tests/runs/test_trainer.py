@@ -11,7 +11,8 @@ from tensordict import TensorDict
 from torch import nn
 
 from hdrqn_torchrl.algorithms import Algorithm
-from hdrqn_torchrl.runs.interruption import Interrupted
+from hdrqn_torchrl.runs.evaluation import play
+from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.persistence.weights import load_policy
 from hdrqn_torchrl.runs.trainer import Trainer, crossed
@@ -185,6 +186,27 @@ class CountingLearner(Stateless):
         """Everything is."""
 
 
+class PlainCollector:
+    """As TorchRL's: it can't forget its episodes."""
+
+    def __iter__(self):
+        yield quiet_batch()
+        raise ZeroDivisionError("of the environment")
+
+    def update_policy_weights_(self):
+        pass
+
+
+def test_an_error_out_of_a_collector_of_torchrl_is_not_hidden():
+    with pytest.raises(ZeroDivisionError, match="of the environment"):
+        make_trainer(total_frames=30, collector=PlainCollector()).train()
+
+
+def test_a_collector_that_does_not_keep_its_state_has_no_checkpoints(tmp_path):
+    with pytest.raises(ValueError, match="collector must keep its state where checkpoints are given, got a PlainColl"):
+        make_trainer(total_frames=30, collector=PlainCollector(), checkpoints=Checkpoints(tmp_path))
+
+
 def test_every_learner_gets_each_batch_and_its_own_updates():
     learners = {"sub": CountingLearner(3), "meta": CountingLearner(0)}
     trainer = make_trainer(total_frames=20, log_frames=10, learners=learners)
@@ -342,15 +364,27 @@ class TestStopRequests:
         assert [row["flat/updates"] for row in trainer.logger.rows] == [5 * count for count in range(11)]
 
     def test_a_stop_during_an_evaluation_ends_it_at_once(self, tmp_path):
-        def stopped_evaluation():
-            signal.raise_signal(signal.SIGINT)
-            raise AssertionError("it went on")
+        """And leaves no trace: a signal may come while random numbers are brought back."""
+        stop = StopRequest()
 
-        trainer = make_trainer(total_frames=10, checkpoints=Checkpoints(tmp_path))
-        trainer.evaluate = stopped_evaluation
-        with pytest.raises(Interrupted, match="stopped by SIGINT") as stop:
+        class Stopping:
+            steps = 0
+
+            def add_step(self, step, counted=None):
+                self.steps += 1
+                signal.raise_signal(signal.SIGINT)
+
+        seen = Stopping()
+        env, before = small_env(2), torch.get_rng_state()
+        algorithm = build("drqn", env)
+        judge = algorithm.transform(small_env(2))
+        trainer = make_trainer(total_frames=10, checkpoints=Checkpoints(tmp_path), stop=stop)
+        trainer.evaluate = lambda: play(judge, algorithm.policy, episodes=20, observers=[seen], check=stop.check)
+        torch.set_rng_state(before)
+        with pytest.raises(Interrupted, match="stopped by SIGINT") as reason:
             trainer.train()
-        assert stop.value.exit_code == 130 and not trainer.logger.rows
+        assert reason.value.exit_code == 130 and not trainer.logger.rows and seen.steps == 1
+        assert torch.equal(torch.get_rng_state(), before)
 
     def test_signal_handlers_are_restored_after_training(self):
         former = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]

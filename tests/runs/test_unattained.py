@@ -44,6 +44,17 @@ def test_nothing_is_said_where_all_are_attained():
     assert told(watch) == []
 
 
+def test_a_resumed_training_knows_what_was_seen_before():
+    first, second, third = (UnattainedSubgoals([ROOMS, GOALS]) for _ in range(3))
+    first.observe(batch([1, 1], [0, 1]))
+    second.load_state_dict(first.state_dict())
+    second.observe(batch([0, 0], [0, 0]))
+    (message,) = told(second)
+    assert f"['key'] in {2 * EPISODES} episodes" in message
+    third.load_state_dict(second.state_dict())
+    assert told(third) == []  # once for each training
+
+
 @pytest.mark.parametrize(("episodes", "share"), [(EPISODES - 1, 0.5), (EPISODES, 0.09)])
 def test_it_waits_until_there_was_time_enough(episodes, share):
     watch = UnattainedSubgoals([GOALS])

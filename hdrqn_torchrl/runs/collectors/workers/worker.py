@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import random
 from typing import Any, NamedTuple, Protocol
 
-import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -13,6 +11,7 @@ from torchrl.envs import EnvBase
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import EpsilonGreedy
+from hdrqn_torchrl.random_numbers import seed_all
 from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
 from hdrqn_torchrl.runs.collectors.workers.packing import pack, unpack
 from hdrqn_torchrl.runs.persistence.checkpoint import RandomState
@@ -71,9 +70,7 @@ class Worker:
     ) -> None:
         if threads is not None:
             torch.set_num_threads(threads)
-        random.seed(seed)
-        np.random.seed(seed % 2**32)
-        torch.manual_seed(seed)
+        seed_all(seed)
         env, self.policy = make(index, seed)
         worlds = env.batch_size[0]
         for module in self.policy.modules():
