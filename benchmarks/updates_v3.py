@@ -107,7 +107,11 @@ class RawLearner:
         self.parameters, self.target_parameters = list(self.online.parameters()), list(self.target.parameters())
         self.optimizer = torch.optim.Adam(self.parameters, lr=LEARNING_RATE, fused=True)
         self.rows = flatten(learner.buffer.storage[:])  # [time, N, ...]
-        self.count, self.steps, self.lower = learner.settings.batch_size, learner._sequence_len, precision == "bf16"
+        self.count, self.steps, self.lower = (
+            learner.settings.batch_size,
+            learner.replay.sequence_len,
+            precision == "bf16",
+        )
         starts = self.rows["init"][: len(self.rows["init"]) - self.steps + 1].nonzero()
         self.time, self.environment = starts.unbind(1)
 

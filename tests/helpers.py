@@ -26,6 +26,7 @@ from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import EpsilonGreedy, RepeatingEpsilonGreedy, compact_network
 from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
 from hdrqn_torchrl.runs.evaluation import evaluate
+from hdrqn_torchrl.runs.interruption import StopRequest
 from hdrqn_torchrl.runs.logging import RunLogger
 from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.trainer import Trainer
@@ -140,12 +141,12 @@ def make_training(
     evaluation_env = algorithm.transform(worlds(8))
     defaults = {"total_frames": 256, "log_frames": 96, "evaluation_frames": 128, "checkpoint_frames": 1_000_000}
     settings = defaults | {"checkpoints": Checkpoints(folder / "checkpoints")} | settings
-    total_frames = settings["total_frames"]
+    total_frames, stop = settings["total_frames"], settings.setdefault("stop", StopRequest())
     return Trainer(
         algorithm,
         make_collector(algorithm, env, 8, total_frames, ResumableCollector),
         logger=RunLogger(folder, total_frames=total_frames, console=Console(file=io.StringIO())),
-        evaluate=lambda: evaluate(evaluation_env, algorithm.policy, episodes=8),
+        evaluate=lambda: evaluate(evaluation_env, algorithm.policy, episodes=8, check=stop.check),
         **settings,
     )
 

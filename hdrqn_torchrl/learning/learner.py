@@ -10,19 +10,11 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import HardUpdate, LossModule
 
-from hdrqn_torchrl.data import Continuity, sample_sequences
-from hdrqn_torchrl.data.device_draws import DeviceDraws
+from hdrqn_torchrl.data import Continuity, SequenceBuffer
 from hdrqn_torchrl.devices import to_device
 from hdrqn_torchrl.learning.captured import Captured, wants_capture
 from hdrqn_torchrl.learning.finite import FiniteGuard
-from hdrqn_torchrl.learning.memory import (
-    Extract,
-    make_longer_episodes,
-    make_memory,
-    warn_incomplete,
-    warn_of_longer,
-    warn_old_memory,
-)
+from hdrqn_torchrl.learning.memory import Extract, Replay, warn_old_memory
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision
 from hdrqn_torchrl.learning.settings import LearnerSettings, check_loss
@@ -95,7 +87,7 @@ class Learner:
         samples_per_draw: int = 8,
     ) -> None:
         settings = settings.scaled()
-        self.network, self.settings, self.loss, self.extract, self.refresh = network, settings, loss, extract, refresh
+        self.network, self.settings, self.loss, self.extract = network, settings, loss, extract
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
         check_loss(settings, loss)
@@ -109,12 +101,14 @@ class Learner:
         self.optimizer = GroupedAdam(
             self._parameters, separate=separate or {}, learning_rate=self.learning_rate, capturable=captures
         )
-        self.buffer = make_memory(
+        self.replay = Replay(
             settings,
             loss,
             num_envs=num_envs,
             episode_len=episode_len,
             samples_per_draw=samples_per_draw,
+            refresh=refresh,
+            on_device=captures and not (refresh is not None and refresh_reads),
             device=self.device,
         )
         self._step = UpdateStep(
@@ -126,20 +120,17 @@ class Learner:
             max_grad_norm=settings.max_grad_norm,
         )
         self._captured = Captured(self._gradient_step) if captures else None
-        self._sequence_len = (settings.slice_len or 0) + getattr(loss, "lookahead", 0)
-        first_sequence = (num_envs or 0) * self._sequence_len if settings.sampling == "episode_starts" else 0
+        first_sequence = (num_envs or 0) * self.replay.sequence_len if settings.sampling == "episode_starts" else 0
         self.first_update_at = max(settings.warmup_frames, first_sequence)
         """Frames without updates at the beginning: all worlds play the first sequence at the same time."""
-        draws = captures and not (refresh is not None and refresh_reads)
-        self._draws = (
-            DeviceDraws(self.buffer, sequences=settings.batch_size, length=self._sequence_len) if draws else None
-        )
-        self._longer = make_longer_episodes(settings, loss, num_envs=num_envs, episode_len=episode_len)
         self._continuity = Continuity(memory_key=_memory_of(network))
-        self._drawn: list[TensorDictBase] = []
         self.held = False
         """Whether it only stores; updates missed meanwhile are not made up for."""
-        self._has_warned = self._could_draw = False
+
+    @property
+    def buffer(self) -> SequenceBuffer:
+        """Its replay memory."""
+        return self.replay.buffer
 
     @property
     def frames(self) -> int:
@@ -169,7 +160,6 @@ class Learner:
             batch = to_device(batch, self.device)
         self._continuity.check(batch)
         self.schedule.frames += batch.numel()
-        self._drawn = []
         self.optimizer.set_learning_rate(self.learning_rate)
         try:
             transitions = self.extract(batch)
@@ -178,37 +168,22 @@ class Learner:
                 f"batch must hold all that environment and policy wrote, got one without an entry ({error.args[0]}); "
                 "collect without compact_obs=True, and leave nothing out."
             ) from error
-        if transitions is not None:
-            self.buffer.extend(transitions)
-            self._longer = warn_of_longer(self._longer, transitions, self.settings)
-        if self.schedule.frames_owed > 0 and (self.held or not self._can_draw()):
+        self.replay.store(transitions)
+        if self.schedule.frames_owed > 0 and (self.held or not self.replay.can_draw()):
             self.schedule.let_go()
-
-    def _can_draw(self) -> bool:
-        """Whether the memory holds a sequence; warns once where it is full of others."""
-        if self._could_draw and self._draws is not None and self.buffer.keeps_starts:
-            return True  # without asking the device
-        self._could_draw = self.buffer.can_sample()
-        if not self._could_draw and self.buffer.is_full() and not self._has_warned:
-            self._has_warned = True
-            warn_incomplete(self.settings, self._sequence_len)
-        return self._could_draw
 
     def updates_due(self) -> int:
         """How many updates are owed for the frames seen so far; none while no sequence can be drawn."""
         due = self.schedule.due
-        return due if due and self._can_draw() else 0
+        return due if due and self.replay.can_draw() else 0
 
     def learn(self) -> dict[str, Tensor]:
         """Draws one minibatch and learns from it: :meth:`update` of :meth:`sample`, or both captured together."""
-        return self.update(self.sample() if self._draws is None else None)
+        return self.update(self.sample() if self.replay.draws is None else None)
 
     def sample(self) -> TensorDictBase:
         """One minibatch of sequences ``[batch_size, slice_len + lookahead]``."""
-        if not self._drawn:
-            self._drawn = list(sample_sequences(self.buffer).split(self.settings.batch_size, 0))
-        sample = self._drawn.pop()
-        return sample if self.refresh is None else self.refresh(sample)
+        return self.replay.sample()
 
     def update(self, sample: TensorDictBase | None) -> dict[str, Tensor]:
         """One gradient step on ``sample`` and one soft update of the target network.
@@ -225,12 +200,12 @@ class Learner:
                 :meth:`check_finite` raises it.
         """
         self.guard.begin(f"update {self.updates + 1}, frame {self.frames}")
-        if sample is None and self._draws is not None:
-            self._draws.refresh()
+        if sample is None and self.replay.draws is not None:
+            self.replay.draws.refresh()
         if self._captured is None:
             report = self._gradient_step(sample, None)
         else:
-            report = self._captured(sample, self._step.draw_ahead(self._sequence_len))
+            report = self._captured(sample, self._step.draw_ahead(self.replay.sequence_len))
         priority = report.pop("priority", None)
         self.schedule.updates += 1
         if self.settings.priority_exponent is not None and sample is not None:
@@ -241,12 +216,12 @@ class Learner:
         """What is captured: the update, and the draw if there is no ``sample``."""
         if sample is not None:
             return self._step(sample, self.precision, ahead)
-        assert self._draws is not None
-        sample = self._draws.draw()
-        report = self._step(sample if self.refresh is None else self.refresh(sample), self.precision, ahead)
+        assert self.replay.draws is not None
+        sample = self.replay.draw()
+        report = self._step(sample, self.precision, ahead)
         priority = report.pop("priority", None)
         if self.settings.priority_exponent is not None and priority is not None:
-            self._draws.set_priorities(sample, priority)
+            self.replay.draws.set_priorities(sample, priority)
         return report
 
     @property
@@ -287,7 +262,7 @@ class Learner:
 
     def memory_state_dict(self) -> dict[str, Any]:
         """The replay memory, the minibatches drawn from it and when it is warm: large, and optional."""
-        return {"buffer": self.buffer.state_dict(), "drawn": self._drawn, "warm_at": self.schedule.warm_at}
+        return self.replay.state_dict() | {"warm_at": self.schedule.warm_at}
 
     def load_memory_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`memory_state_dict` returned.
@@ -301,8 +276,8 @@ class Learner:
             warn_old_memory()
             self.begin_empty()
             return
-        self.buffer.load_state_dict(state["buffer"])
-        self._drawn, self.schedule.warm_at, self._could_draw = list(state["drawn"]), state["warm_at"], False
+        self.replay.load_state_dict(state)
+        self.schedule.warm_at = state["warm_at"]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned; without a memory it begins with an empty one and warms up again.
@@ -324,18 +299,15 @@ class Learner:
             self.precision = choose_precision(state.get("precision", "fp32"), self.network)
 
     def rewrite(self, change: Callable[..., None]) -> None:
-        """Changes stored transitions (:meth:`SequenceBuffer.rewrite`); minibatches drawn before are drawn anew."""
-        self.buffer.rewrite(change)
-        self._drawn = []
+        """Changes stored transitions (:meth:`Replay.rewrite`)."""
+        self.replay.rewrite(change)
 
     def begin_empty(self) -> None:
         """Empties the memory; updates wait until it is warm again."""
         if self._captured is not None:
             self._captured.reset()
-        if len(self.buffer):
-            self.buffer.empty()
+        self.replay.empty()
         self.schedule.warm_up_again()
-        self._drawn, self._could_draw = [], False
 
 
 def _memory_of(network: TensorDictModuleBase) -> NestedKey | None:

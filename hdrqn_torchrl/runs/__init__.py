@@ -12,20 +12,22 @@ if TYPE_CHECKING:
     from hdrqn_torchrl.runs.agents import Agent, load_agent
     from hdrqn_torchrl.runs.collectors.resumable import ResumableCollector
     from hdrqn_torchrl.runs.evaluation import evaluate, play
+    from hdrqn_torchrl.runs.interruption import StopRequest
     from hdrqn_torchrl.runs.logging import RunLogger
     from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
     from hdrqn_torchrl.runs.persistence.weights import load_policy, load_weights, save_weights
     from hdrqn_torchrl.runs.trainer import Trainer
 
 __all__ = [
-    "Agent", "Checkpoints", "ResumableCollector", "RunLogger", "Trainer", "evaluate", "load_agent", "load_policy",
-    "load_weights", "play", "save_weights",
+    "Agent", "Checkpoints", "ResumableCollector", "RunLogger", "StopRequest", "Trainer", "evaluate", "load_agent",
+    "load_policy", "load_weights", "play", "save_weights",
 ]  # fmt: skip
 _MODULES = {
     "Agent": "agents",
     "Checkpoints": "persistence.checkpoint",
     "ResumableCollector": "collectors.resumable",
     "RunLogger": "logging",
+    "StopRequest": "interruption",
     "Trainer": "trainer",
     "evaluate": "evaluation",
     "load_agent": "agents",

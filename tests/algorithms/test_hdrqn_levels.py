@@ -224,7 +224,7 @@ def test_hindsight_and_refreshed_states_work_at_the_lowest_levels():
     assert len(sample) == 4 * algorithm.learners["sub"].network.network.num_conditions
     for learner in algorithm.learners.values():
         assert learner.learn()["loss"].isfinite()
-    assert algorithm.learners["rooms"].refresh is not None and algorithm.learners["meta"].refresh is None
+    assert algorithm.learners["rooms"].replay.refresh is not None and algorithm.learners["meta"].replay.refresh is None
 
 
 @pytest.mark.parametrize("name", ["hdqn", "v1", "v2", "v3"])

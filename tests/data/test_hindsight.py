@@ -270,7 +270,7 @@ class TestSubLearner:
         env = small_env(8)
         algorithm = build("v2", env, settings=tiny_settings(trace_decay=0.9), sub_hindsight=True)
         learner = algorithm.learners["sub"]
-        sample = learner.refresh(learner.extract(collect(algorithm, env, 40)[0]))
+        sample = learner.replay.refresh(learner.extract(collect(algorithm, env, 40)[0]))
         barred = ~sample["eligible"].squeeze(-1)
         assert (barred[:, :-1] & ~barred[:, 1:]).any()  # eligible steps follow
         before = learner.loss(sample)
@@ -310,7 +310,7 @@ class TestSubLearner:
         wanted = steps["next", "intrinsic_reward"].clone()
         steps["next", "intrinsic_reward"].fill_(9.0)
         steps["subgoal"] = 1 - steps["subgoal"]
-        assert torch.equal(learner.refresh(steps)["next", "intrinsic_reward"][len(steps) :], wanted)
+        assert torch.equal(learner.replay.refresh(steps)["next", "intrinsic_reward"][len(steps) :], wanted)
 
     def test_n_step_targets_are_refused(self):
         with pytest.raises(ValueError, match=r"sub\.n_step must be 1 with sub_hindsight=True, got 2: later actions"):
@@ -655,7 +655,7 @@ class TestMetaInputs:
     def test_refreshed_states_are_those_of_a_sub_controller_with_the_relabelled_subgoal(self, time):
         algorithm, steps, told = told_options(meta_input_time=time, refresh_hidden_steps=7)
         network, state, changed = algorithm.policy.sub_controller.network, None, 0
-        refreshed = algorithm.learners["meta"].refresh(told.clone().unsqueeze(0)).squeeze(0)
+        refreshed = algorithm.learners["meta"].replay.refresh(told.clone().unsqueeze(0)).squeeze(0)
         for row, stored, (env, start, end) in zip(refreshed, told, places(steps, told), strict=True):
             before = network.initial_state(1)[0] if row["is_init"] else state[0]
             seen = steps["observation"][env, start : end + 1]

@@ -48,10 +48,10 @@ def test_stored_steps_are_told_anew_and_minibatches_drawn_before_are_forgotten()
     for batch in islice(batches, 3):
         agent.observe(batch)
     learner.sample()
-    assert learner._drawn and not learner.buffer.storage[:]["next", "attained"].any()
+    assert learner.replay._drawn and not learner.buffer.storage[:]["next", "attained"].any()
     agent.observe(next(batches))
     stored = learner.buffer.storage[:]
-    assert not learner._drawn and torch.equal(
+    assert not learner.replay._drawn and torch.equal(
         stored["next", "attained"].any(-1), (stored["next", "events"] > 0).any(-1)
     )
     assert stored["next", "attained"].any() and stored["subgoal_mask"][..., 1:].any()

@@ -89,7 +89,7 @@ class TestCapturedUpdates:
         captured, plain = (make() for _ in "ab")
         for level, learner in captured.items():
             assert_same_reports(learner, plain[level], updates=8)
-            assert learner._drawn == []
+            assert learner.replay._drawn == []
             states = [each.buffer.state_dict()["_sampler"] for each in (learner, plain[level])]
             if kind == "priorities":
                 assert all(torch.equal(*(state[name] for state in states)) for name in ("priorities", "starts"))
