@@ -19,9 +19,7 @@ from typing import Any
 ROOT = Path(__file__).parent.parent
 os.environ["RL_LOGGING_LEVEL"], os.environ["OMP_NUM_THREADS"] = "WARNING", "1"
 FORK = multiprocessing.get_context("forkserver")
-FORK.set_forkserver_preload(
-    ["helpers", "processes", "hdrqn_torchrl.cli.train", "hdrqn_torchrl.runs.persistence.folder"]
-)
+FORK.set_forkserver_preload(["helpers", "processes", "hdrqn_torchrl.cli.train", "hdrqn_torchrl.cli.training"])
 
 
 def start(target, *arguments) -> BaseProcess:
@@ -116,7 +114,7 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
     """What train.py does in an empty run folder or that of a killed process, with a training from helpers.py."""
     from helpers import make_training, seed_everything
 
-    from hdrqn_torchrl.cli import train
+    from hdrqn_torchrl.cli import train, training
     from hdrqn_torchrl.cli.resuming import Plan
 
     diary, orphans, began = Diary(folder / "diary.jsonl"), leftovers(folder), time.monotonic()
@@ -146,8 +144,8 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
         diary.note("start", frames=trainer.frames, orphans=orphans, left=leftovers(folder), seconds=seconds)
         return trainer, *rest
 
-    begin, train.build_run, train.begin = train.begin, build_run, noted_begin
-    train.record, train.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
+    begin, training.build_run, training.begin = training.begin, build_run, noted_begin
+    training.record, training.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
     config: Any = SimpleNamespace(threads=1, init_from=None, allowed_targets=[], resume_override=False)
     train.train(Plan(folder, config, {}, resumed=True))
     diary.note("done")

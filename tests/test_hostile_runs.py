@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.analysis import archives
-from hdrqn_torchrl.cli import evaluate, findings, plot, train
+from hdrqn_torchrl.cli import evaluate, plot, train
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
@@ -90,7 +90,7 @@ def plotted(run):
 
 def reported(run):
     with ExitStack() as stack:
-        findings.read_runs([str(run)], stack)
+        study_runs.read_runs([str(run)], stack)
 
 
 READERS = {"evaluate": evaluated, "resume": resumed, "plot": plotted, "report": reported}
@@ -397,10 +397,10 @@ def test_an_archive_holds_only_files_of_runs(run, monkeypatch, members):
         ExitStack() as stack,
         pytest.raises(SettingsError, match=r"runs must name folders or readable archives"),
     ):
-        findings.read_runs([str(path)], stack)
+        study_runs.read_runs([str(path)], stack)
 
 
 def test_a_file_that_is_not_an_archive_is_refused(run):
     (run.parent / "runs.tar.xz").write_bytes(b"text")
     with ExitStack() as stack, pytest.raises(SettingsError, match="readable archives"):
-        findings.read_runs([str(run.parent / "runs.tar.xz")], stack)
+        study_runs.read_runs([str(run.parent / "runs.tar.xz")], stack)

@@ -9,8 +9,8 @@ from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.settings import commands
 
 ORDER = (
-    "keys", "devices", "transforms", "envs", "modules", "objectives", "data", "learning", "discovery", "algorithms",
-    "runs", "export", "rendering", "analysis", "cli",
+    "keys", "devices", "random_numbers", "transforms", "envs", "modules", "objectives", "data", "learning", "discovery",
+    "algorithms", "runs", "export", "rendering", "analysis", "cli",
 )  # fmt: skip
 ROOT = Path(hdrqn_torchrl.__file__).parent
 FILES = sorted(path for path in ROOT.rglob("*.py") if path != ROOT / "__init__.py")

@@ -16,7 +16,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from programs import CONF
 
-from hdrqn_torchrl.cli import train
+from hdrqn_torchrl.cli import train, training
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
@@ -119,7 +119,7 @@ def refused(number, folder, run):
         train.check(settings)
         plan = Plan(folder, settings, {}, resumed=False)
         folder.mkdir()
-        with train.in_words(plan):
+        with training.in_words(plan):
             run(plan)
     except (SettingsError, RunError, HydraException) as error:
         return str(error)
@@ -153,7 +153,7 @@ def check_trains(number, folder):
 
 
 def check_builds(number, folder):
-    if (told := refused(number, folder, train.build_run)) is not None:
+    if (told := refused(number, folder, training.build_run)) is not None:
         check_message(number, told)
     return told
 
@@ -190,6 +190,7 @@ def test_many_random_configurations_train_or_are_refused_with_a_clear_error(firs
         ("algo.max_option_steps=[1]", "algo.max_option_steps must be an integer or null, got [1]"),
         ("checkpoint.interval_frames=[1]", "checkpoint.interval_frames"),
         ("++evaluation.env={num_goals: 3}", "evaluation.env must not change what the agent sees or does"),
+        ("++evaluation.env={num_goals: x}", "evaluation.env.num_goals must be an integer, got 'x'"),
         ("env.view=abc", "env.view must be an integer or null, got 'abc'"),
         ("network.widths=[x]", "network.widths must be a list of integers, got ['x']"),
         ("algo.meta.burn_in=1.5", "algo.meta.burn_in must be in [0, 1), got 1.5"),
@@ -198,4 +199,4 @@ def test_many_random_configurations_train_or_are_refused_with_a_clear_error(firs
 )
 def test_settings_that_used_to_end_in_a_traceback_are_refused_by_name(override, rule, tmp_path):
     parts = ("gridworld", "v2", "compact")
-    assert rule in refused((parts, [override]), tmp_path / "run", train.build_run)
+    assert rule in refused((parts, [override]), tmp_path / "run", training.build_run)

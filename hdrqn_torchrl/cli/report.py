@@ -37,9 +37,9 @@ from hdrqn_torchrl.analysis.grouping import value_of
 from hdrqn_torchrl.analysis.results import AXES, final_value
 from hdrqn_torchrl.cli.command_line import as_list, command_line
 from hdrqn_torchrl.cli.entries import common_references, note, shortened
-from hdrqn_torchrl.cli.findings import Found, Matched, Runs, check_archive, keep_runs, read_runs, runs_of_jobs
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
+from hdrqn_torchrl.cli.study_runs import Found, Matched, Runs, check_archive, keep_runs, read_runs, runs_of_jobs
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json, write_whole
 from hdrqn_torchrl.runs.settings.arguments import SettingsError

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from hdrqn_torchrl.analysis.claims import Near
-from hdrqn_torchrl.cli import findings, report
+from hdrqn_torchrl.cli import report, study_runs
 from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.cli.configuration import CONF
 from hdrqn_torchrl.cli.studies import STUDIES, Job, is_run_of, jobs_of
@@ -214,7 +214,7 @@ def test_seeds_stand_in_the_order_of_numbers_and_commits_are_of_runs_that_count(
     went_on = [{"commit": "89abcdef01-dirty"}]
     (runs[0] / "run.json").write_text(json.dumps(origin | {"resumed_with": went_on}))
     with ExitStack() as stack:
-        members = findings.read_runs([str(tmp_path)], stack)
+        members = study_runs.read_runs([str(tmp_path)], stack)
     row = report.table_row("v2", members, "wall_seconds")
     assert row.startswith("| v2 | 9, 10 |") and row.endswith("| 0123456, 89abcde-dirty |")
 
@@ -352,9 +352,9 @@ class TestStudies:
 def test_the_kept_runs_still_belong_to_their_studies():
     """Settings that were renamed or left to the task since they were made must not keep them from matching."""
     with ExitStack() as stack:
-        kept = findings.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
-        found = findings.runs_of_jobs("gridworld", "small", kept)
-        of_authors = findings.runs_of_jobs("authors_choices", "small", kept)
+        kept = study_runs.read_runs([str(Path(CONF).parent / "docs" / "results" / "runs.tar.xz")], stack)
+        found = study_runs.runs_of_jobs("gridworld", "small", kept)
+        of_authors = study_runs.runs_of_jobs("authors_choices", "small", kept)
     assert (len(found.runs), found.missing, found.passed_over) == (30, 0, [])
     assert len({run.entry.run.folder for _, run in found.runs}) == 30
     assert len(of_authors.runs) > 0
@@ -376,7 +376,7 @@ def test_a_run_with_a_bound_of_its_own_is_another_one(tmp_path):
     make_run(tmp_path / "short", "experiment=gridworld", "algo=v3", "algo.learner.slice_len=10")
     make_run(tmp_path / "bounded", "experiment=gridworld", "algo=v3", "algo.max_meta_target=0.5")
     with ExitStack() as stack:
-        runs = findings.read_runs([str(tmp_path)], stack)
+        runs = study_runs.read_runs([str(tmp_path)], stack)
     matching = [run.entry.run.folder.name for run in runs if is_run_of(job, run.settings, run.overridden)]
     assert matching == ["same"]
 

@@ -23,7 +23,7 @@ from programs import CONF, ROOT, TINY, TINY_HDRQN, call
 from safetensors.torch import load_file
 
 from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
-from hdrqn_torchrl.cli import train
+from hdrqn_torchrl.cli import train, training
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import compact_network
@@ -180,8 +180,8 @@ class TestMessages:
 
 def test_a_training_that_ends_before_a_learner_begins_is_warned_of():
     agent = make_hdrqn(small_env(), compact_network(8, (8,)), meta=LearnerSettings(warmup_frames=9_000))
-    assert train.late_learners(agent, 9_001) == []
-    assert train.late_learners(agent, 9_000) == [
+    assert training.late_learners(agent, 9_001) == []
+    assert training.late_learners(agent, 9_000) == [
         "warning: total_frames=9,000 must be above warmup_frames=9,000 for the learner 'meta' to learn anything; use "
         "more frames or a shorter warmup"
     ]
@@ -196,8 +196,8 @@ def test_worlds_of_which_most_of_a_training_sees_the_first_sequence_only_are_war
     )
     assert agent.learners["joint"].first_update_at == 640 + 64 * agent.learners["joint"].loss.lookahead
     first = agent.learners["joint"].first_update_at
-    assert train.late_learners(agent, 4 * first) == []
-    (sentence,) = train.late_learners(agent, 4 * first - 1)
+    assert training.late_learners(agent, 4 * first) == []
+    (sentence,) = training.late_learners(agent, 4 * first - 1)
     assert f"learns nothing in the first {first:,} frames" in sentence and "use fewer worlds or more frames" in sentence
 
 
@@ -572,4 +572,4 @@ def test_a_figure_s_title_names_the_task_by_its_id():
     run = SimpleNamespace(
         choices={"env": "gym", "algo": "drqn"}, config=SimpleNamespace(env={"id": "CartPole-v1"}, seed=3)
     )
-    assert train.title_of(run) == "env=gym algo=drqn id=CartPole-v1 seed=3"
+    assert training.title_of(run) == "env=gym algo=drqn id=CartPole-v1 seed=3"

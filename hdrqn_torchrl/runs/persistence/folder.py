@@ -6,11 +6,14 @@ import json
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.persistence.files import write_whole
 from hdrqn_torchrl.runs.persistence.locking import InUse, lock
-from hdrqn_torchrl.runs.trainer import Trainer
+
+if TYPE_CHECKING:
+    from hdrqn_torchrl.runs.trainer import Trainer
 
 
 def write_summary(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import pkgutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any
 
@@ -118,6 +119,24 @@ def build_env(settings: RunSettings, changes: Mapping[str, Any], allowed: Sequen
     return build(settings.env | dict(changes), place="env", allowed=allowed)
 
 
+def build_evaluation_env(settings: RunSettings, changes: Mapping[str, Any], allowed: Sequence[str] = ()) -> EnvBase:
+    """The bare environment of its evaluations: ``evaluation.env`` goes before other changes."""
+    with _changes_named(settings):
+        return build_env(settings, {**changes, **settings.evaluation.env}, allowed)
+
+
+@contextmanager
+def _changes_named(settings: RunSettings) -> Iterator[None]:
+    """Inside, errors about what ``evaluation.env`` changes name it."""
+    try:
+        yield
+    except SettingsError as error:
+        place, _, name = str(error).partition(" ")[0].partition(".")
+        if place == "env" and name in settings.evaluation.env:
+            raise SettingsError(f"evaluation.{error}") from error
+        raise
+
+
 def build_algorithm(
     settings: RunSettings, changes: Mapping[str, Any] | None = None, allowed: Sequence[str] = ()
 ) -> tuple[EnvBase, Algorithm]:
@@ -130,6 +149,8 @@ def build_algorithm(
     """
     for place, part in _parts(settings):  # all of them, before the first is built
         check_all(part, place, allowed)
+    with _changes_named(settings):
+        check_all({**settings.env, **settings.evaluation.env}, "env", allowed)
     env = build_env(settings, changes or {}, allowed)
     network = build(settings.network, place="network", allowed=allowed)
     return env, build(settings.algo, env, network, place="algo", allowed=allowed)
@@ -138,7 +159,6 @@ def build_algorithm(
 def _parts(settings: RunSettings) -> Iterator[tuple[str, Settings]]:
     """All settings that something is built from, by their places."""
     yield from (("env", settings.env), ("algo", settings.algo), ("network", settings.network))
-    yield "env", {**settings.env, **settings.evaluation.env}
     yield from ((f"logger.loggers[{index}]", each) for index, each in enumerate(settings.logger["loggers"]))
 
 
