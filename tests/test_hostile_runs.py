@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.analysis import archives
-from hdrqn_torchrl.cli import evaluate, plot, train
+from hdrqn_torchrl.cli import evaluate, plot, study_runs, train
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
