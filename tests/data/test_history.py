@@ -43,7 +43,7 @@ def states(part):
 @pytest.mark.parametrize("meta_input_time", ["after_last_decision", "after_last_observation"])
 def test_with_the_same_weights_the_states_are_those_seen_when_acting(meta_input_time):
     _, meta = filled_meta_learner(meta_input_time=meta_input_time)
-    refresh, meta.refresh = meta.refresh, None
+    refresh, meta.replay.refresh = meta.replay.refresh, None
     stored = meta.sample()
     refreshed = refresh(stored.clone())
     assert (stored["history_steps"] > 1).any()
@@ -52,7 +52,7 @@ def test_with_the_same_weights_the_states_are_those_seen_when_acting(meta_input_
 
 def test_with_new_weights_the_states_change_except_at_the_start_of_an_episode():
     algorithm, meta = filled_meta_learner()
-    refresh, meta.refresh = meta.refresh, None
+    refresh, meta.replay.refresh = meta.replay.refresh, None
     stored = meta.sample()
     with torch.no_grad():
         for parameter in algorithm.policy.sub_controller.network.parameters():
@@ -65,7 +65,7 @@ def test_with_new_weights_the_states_change_except_at_the_start_of_an_episode():
 
 def test_states_after_longer_options_stay_as_stored():
     algorithm, meta = filled_meta_learner(steps=3)
-    refresh, meta.refresh = meta.refresh, None
+    refresh, meta.replay.refresh = meta.replay.refresh, None
     stored = meta.sample()
     with torch.no_grad():
         algorithm.policy.sub_controller.network.memory.bias_ih_l0.add_(0.5)
