@@ -63,21 +63,18 @@ def critic(after: TensorDictBase) -> Tensor:
 
 def make_learners(sub: modules.SubController, meta: modules.MetaController) -> dict[str, Learner]:
     """Each level learns from what it needs, under the names that ``SubgoalTransform`` gave them."""
-    ends = {"reward": "intrinsic_reward", "done": "option_done", "terminated": "option_terminated"}
     steps = StepSelector(
         root_keys=["observation", "action", "option_init"],
-        next_keys=[*ends.values()],
+        next_keys=["intrinsic_reward", "option_done", "option_terminated"],
         subgoal_key="subgoal",
     )
     options = OptionExtractor(input_keys=meta.input_keys, mask_key=None)
-    option_keys = {"action": "subgoal", "reward": "option_return", "steps": "option_steps"}
     settings = partial(LearnerSettings, frames_per_update=8, warmup_frames=1000, tau=0.01, max_target=1.0)
     sub_settings, meta_settings = settings(slice_len=8), settings(slice_len=4)
-    sub_loss = make_recurrent_loss(sub, sub_settings, loss_keys={**ends, "init": "option_init"})
-    meta_loss = make_recurrent_loss(meta, meta_settings, loss_keys=option_keys)
+    losses = make_recurrent_loss(sub, sub_settings), make_recurrent_loss(meta, meta_settings)
     return {
-        "sub": Learner(sub, sub_settings, extract=steps, loss=sub_loss, num_envs=NUM_ENVS),
-        "meta": Learner(meta, meta_settings, extract=options, loss=meta_loss),
+        "sub": Learner(sub, sub_settings, extract=steps, loss=losses[0], num_envs=NUM_ENVS),
+        "meta": Learner(meta, meta_settings, extract=options, loss=losses[1]),
     }
 
 

@@ -109,6 +109,8 @@ class LevelBuilder:
             cell_key=cell_key,
             exploration_key=names.exploration,
             option_keys=above or keys.OptionKeys(),
+            return_key=names.option_return,
+            steps_key=names.option_steps,
         )
 
     def sub_learner(self, controller: SubController, settings: LearnerSettings) -> Learner:
@@ -152,7 +154,7 @@ class LevelBuilder:
     ) -> Learner:
         """What trains a level that chooses subgoals: one row for each of its options."""
         level, has = self.has.levels[index], self.has
-        names, max_steps = _keys_of(level), has.task.max_steps
+        max_steps = has.task.max_steps
         largest_return, smallest_return = has.task.largest_extrinsic_return, has.task.smallest_extrinsic_return
         if level.pursues is not None:
             largest_return, smallest_return = self._rewards(index).largest_return, -math.inf
@@ -170,10 +172,7 @@ class LevelBuilder:
                     gamma=self.gamma,
                     largest_return=largest_return,
                     smallest_return=smallest_return,
-                    loss_keys={
-                        "reward": names.option_return,
-                        "steps": names.option_steps if self.smdp_discount else None,
-                    },
+                    loss_keys={} if self.smdp_discount else {"steps": None},
                 ),
                 episode_len=None if max_steps is None else max_steps + 1,  # options, and a row that ends the episode
                 refresh=refresh,

@@ -104,9 +104,10 @@ def make_hdrqn(
         recurrent: ``False`` gives hDQN (with ``version="v1"``).
 
     Raises:
-        ValueError: if the environment lacks something, ``version`` or ``meta_input`` is unknown, v2 is asked for
-            without recurrence, hindsight with n-step targets or priorities (sub level) or with stored states, or more
-            than two levels with ``meta_hindsight`` or ``meta_input_time="after_last_observation"``.
+        ValueError: if the environment lacks something, ``version`` or ``meta_input`` is unknown, v1 is asked for with
+            what only v2 reads (``meta_input``, ``meta_input_time``, ``refresh_hidden_steps``), v2 without recurrence,
+            hindsight with n-step targets or priorities (sub level) or with stored states, or more than two levels with
+            ``meta_hindsight`` or ``meta_input_time="after_last_observation"``.
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv

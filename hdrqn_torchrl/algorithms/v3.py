@@ -119,8 +119,9 @@ def make_v3(
 
     Raises:
         ValueError: if the environment lacks something or states too few sets of subgoals for ``levels``; if sequences
-            may begin in mid-episode without ``stored_state``, so that the memory would wrongly start empty; or if
-            ``learner`` sets what the loss decides itself (``max_target``, ``trace_decay``, ``n_step``).
+            may begin in mid-episode without ``stored_state``, so that the memory would wrongly start empty; if
+            ``joint=False`` or ``phase_one`` is given with one level; or if ``learner`` sets what the loss decides
+            itself (``max_target``, ``trace_decay``, ``n_step``).
 
     Examples:
         >>> from hdrqn_torchrl.envs import MultiGoalGridEnv

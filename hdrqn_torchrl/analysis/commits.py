@@ -17,7 +17,8 @@ def commits_of(origin: dict[str, Any]) -> list[str]:
         >>> commits_of({"commit": "0123456789", "resumed_with": [{"commit": "89abcdef01-dirty"}]})
         ['0123456789', '89abcdef01-dirty']
     """
-    parts = [origin, *origin.get("resumed_with", [])]
+    later = origin.get("resumed_with")
+    parts = [origin, *(each for each in (later if isinstance(later, list) else []) if isinstance(each, dict))]
     return list(dict.fromkeys(str(part.get("commit")) for part in parts))
 
 

@@ -11,7 +11,7 @@ out       text to write; its figures go to a folder of the same name. Whatever i
 size      small (default) or paper: which of a study's two sizes
 studies   only these: studies=gridworld,views; without it there is also an overview of all claims
 keep      archive (.tar.xz) to put settings and measurements of the runs of all studies into, of either size; weights
-          are not kept. If it is there already, runs must name it, too, so that none of its runs are lost
+          are not kept. If it is there already, runs must name it, too: runs of it that no study has now are named
 
 The table of Montezuma's Revenge is made from what evaluate.py wrote into the run folders:
 python evaluate.py run=RUN_DIR checkpoint=last episodes=100 num_envs=20 out=RUN_DIR/evaluations/greedy.json

@@ -13,7 +13,7 @@ from typing import Any
 from hdrqn_torchrl.analysis.archives import keep, unpack
 from hdrqn_torchrl.analysis.grouping import Entry
 from hdrqn_torchrl.analysis.results import find_runs
-from hdrqn_torchrl.cli.entries import note, read_entries
+from hdrqn_torchrl.cli.entries import note, read_entries, shortened
 from hdrqn_torchrl.cli.studies import STUDIES, Job, is_run_of, jobs_of
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.persistence.files import RunFileError, read_json
@@ -39,7 +39,8 @@ class Found:
     @property
     def overridden(self) -> set[str]:
         """Names of the settings that its command line gave values to."""
-        return {str(word).lstrip("+").partition("=")[0] for word in self.origin.get("overrides") or ()}
+        words = self.origin.get("overrides")
+        return {str(word).lstrip("+").partition("=")[0] for word in (words if isinstance(words, list) else [])}
 
 
 Runs = list[tuple[Job, Found]]
@@ -128,12 +129,14 @@ def check_archive(path: str, patterns: list[str]) -> None:
 
 
 def keep_runs(runs: list[Found], archive: Path) -> None:
-    """Puts the runs of all studies into an archive."""
+    """Puts the runs of all studies into an archive, and names those that are of none now, or replaced by others."""
     used = {
         run.entry.run.folder: run
         for study in STUDIES
         for size in study.sizes
         for _, run in runs_of_jobs(study.name, size, runs).runs
     }
+    if others := [str(run.entry.run.folder) for run in runs if run.entry.run.folder not in used]:
+        note(f"note: not in {archive} ({len(others)} runs that no study has now): {shortened(others)}")
     ordered = sorted(used.values(), key=lambda run: sorted(map(str, run.settings.items())))
     keep([run.entry.run.folder for run in ordered], archive)

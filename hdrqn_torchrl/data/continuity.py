@@ -83,23 +83,29 @@ class Continuity:
             jumps = (jumps | ends[:, :-1]) & ~starts.squeeze(-1)
         option_done = batch.get("next").get(self.option_done_key, None)
         left_open = torch.zeros_like(over) if option_done is None else over & ~option_done.squeeze(-1)
-        idle = torch.zeros_like(over[0, 0]) if self._episode is not None else self._is_idle(batch, episode)
-        wrong = (jumps | left_open).any() | idle
+        wrong, idle = (jumps | left_open).any(), None
+        if self._episode is None:
+            idle = self._is_idle(batch)
+            wrong = wrong | idle
         self._check.ask(wrong, partial(_refuse, idle, jumps, left_open, episodes, ends))
         self._episode, self._over = episode[:, -1:].clone(), over[:, -1:].clone()
 
-    def _is_idle(self, batch: TensorDictBase, episode: Tensor) -> Tensor:
-        """Whether the policy's memory stands still in the first step of all worlds, ``[]`` bool."""
+    def _is_idle(self, batch: TensorDictBase) -> Tensor:
+        """Whether the policy's memory stands still in all episodes that begin with the batch, ``[]`` bool.
+
+        There it was zero, and moves; later it may have come to rest. Batches of one step don't show it.
+        """
         memory = None if self.memory_key is None else batch.get(self.memory_key, None)
-        if memory is None or episode.shape[1] < 2:
-            return torch.zeros((), dtype=torch.bool, device=episode.device)
-        goes_on = episode[:, 0] == episode[:, 1]
+        starts = batch.get(self.init_key, None)
+        if memory is None or starts is None or batch.shape[1] < 2:
+            return torch.zeros((), dtype=torch.bool, device=batch.get(self.traj_key).device)
+        begun = starts[:, 0].squeeze(-1) & ~starts[:, 1].squeeze(-1)
         moved = (memory[:, 0] != memory[:, 1]).any(-1)
-        return goes_on.any() & ~(moved & goes_on).any()
+        return begun.any() & ~(moved & begun).any()
 
 
-def _refuse(idle: Tensor, jumps: Tensor, left_open: Tensor, episodes: Tensor, ends: Tensor) -> None:
-    if idle:
+def _refuse(idle: Tensor | None, jumps: Tensor, left_open: Tensor, episodes: Tensor, ends: Tensor) -> None:
+    if idle is not None and idle:
         raise ValueError(
             "the policy must act in every step, got a batch in which its memory stands still; collect without "
             "init_random_frames: the policy's own exploration begins at random."

@@ -28,7 +28,7 @@ class DeviceDraws:
     """
 
     def __init__(self, buffer: SequenceBuffer, *, sequences: int, length: int) -> None:
-        self._storage, self._sampler = buffer._storage, buffer._sampler
+        self._buffer, self._storage, self._sampler = buffer, buffer._storage, buffer._sampler
         self._sequences, self._length = sequences, length
         self._revision: int | None = None
         self._sums: Tensor | None = None  # [capacity], of weights
@@ -36,7 +36,16 @@ class DeviceDraws:
         self._pads = False
 
     def refresh(self) -> None:
-        """Takes up what was written since the last call; no part of a capture."""
+        """Takes up what was written since the last call; no part of a capture.
+
+        Raises:
+            ValueError: if the buffer has transforms.
+        """
+        if self._buffer.transforms:
+            raise ValueError(
+                f"the buffer must have no transforms where updates are captured, got {self._buffer.transforms}: what "
+                "is drawn inside a graph does not pass them; use capture=False."
+            )
         if isinstance(self._sampler, DevicePrioritySampler):
             self._sampler.admit(self._storage)
         elif self._revision != self._storage._mutation_revision:

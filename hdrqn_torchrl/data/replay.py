@@ -43,7 +43,7 @@ class SequenceBuffer(TensorDictReplayBuffer):
     """
 
     def extend(self, tensordicts: TensorDictBase, *, update_priority: bool | None = None) -> Tensor:
-        """Stores transitions ``[N, T]`` or ``[M]``; the newest, if they are too many.
+        """Stores transitions ``[N, T]`` or ``[M]``, after the inverses of transforms; the newest, if they are too many.
 
         Args:
             tensordicts: what is stored.
@@ -52,7 +52,7 @@ class SequenceBuffer(TensorDictReplayBuffer):
         Raises:
             ValueError: if they are not of the shape that the memory was built for.
         """
-        if self._transform is not None and len(self._transform):
+        if self.transforms:
             tensordicts = self._transform.inv(tensordicts)
         self._storage.check_shape(tensordicts)
         written = tensordicts[..., -self._storage.rows :]
@@ -61,6 +61,11 @@ class SequenceBuffer(TensorDictReplayBuffer):
         index = self._extend(written)
         self._storage.newest = None
         return index
+
+    @property
+    def transforms(self) -> int:
+        """How many there are between what is stored and what is drawn."""
+        return 0 if self._transform is None else len(self._transform)
 
     keeps_starts: bool = False
     """Whether a sequence can always be drawn once one could."""

@@ -14,10 +14,11 @@ from hdrqn_torchrl.data import Continuity, SequenceBuffer
 from hdrqn_torchrl.devices import to_device
 from hdrqn_torchrl.learning.captured import Captured, wants_capture
 from hdrqn_torchrl.learning.finite import FiniteGuard
-from hdrqn_torchrl.learning.memory import Extract, Replay, warn_old_memory
+from hdrqn_torchrl.learning.loss_settings import check_loss
 from hdrqn_torchrl.learning.optimizer import GroupedAdam
 from hdrqn_torchrl.learning.precision import choose_precision
-from hdrqn_torchrl.learning.settings import LearnerSettings, check_loss
+from hdrqn_torchrl.learning.replay import Extract, Replay, warn_old_memory
+from hdrqn_torchrl.learning.settings import LearnerSettings
 from hdrqn_torchrl.learning.stored import holds_inputs_twice
 from hdrqn_torchrl.learning.target_network import SoftTargetUpdate
 from hdrqn_torchrl.learning.update_schedule import UpdateSchedule
@@ -90,7 +91,7 @@ class Learner:
         self.network, self.settings, self.loss, self.extract = network, settings, loss, extract
         if settings.priority_exponent is not None and "priority" not in loss.out_keys:
             raise ValueError(f"priority_exponent must be None for {type(loss).__name__}, which reports no priority.")
-        check_loss(settings, loss)
+        check_loss(settings, loss, network)
         self.target_updater = SoftTargetUpdate(self.loss, tau=settings.tau)
         self._parameters = dict(network.named_parameters())
         self.device = next(iter(self._parameters.values())).device

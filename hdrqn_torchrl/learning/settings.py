@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from torchrl.objectives import LossModule
-
 from hdrqn_torchrl.data import FROM_STARTS, Sampling
 from hdrqn_torchrl.learning.captured import Capture
 from hdrqn_torchrl.learning.precision import Precision
@@ -25,7 +23,7 @@ class LearnerSettings:
     :class:`~hdrqn_torchrl.learning.learner.Learner` reads the settings of replay and optimiser. ``burn_in``,
     ``train_exact_states``, ``stored_state``, ``loss_function``, ``double``, ``max_target``, ``trace_decay`` and
     ``n_step`` are settings of the loss, to which :func:`~hdrqn_torchrl.algorithms.make_recurrent_loss` and the builders
-    of algorithms pass them; a learner refuses a loss that was built with others.
+    of algorithms pass them; a learner refuses a loss that was built with others than those that are not the defaults.
 
     Args:
         slice_len: n, number of transitions in a replayed sequence (steps at the sub level, options at the meta level).
@@ -217,40 +215,3 @@ class LearnerSettings:
         if total_frames is not None:
             check_size("total_frames", total_frames, "the frames of the whole training")
         return self if total_frames is None else replace(self, learning_rate_frames=total_frames)
-
-
-_OF_LOSSES = {
-    "burn_in": "burn_in",
-    "train_exact_states": "train_exact_states",
-    "loss_function": "loss_function",
-    "double": "double_q",
-    "trace_decay": "trace_decay",
-    "n_step": "n_step",
-    "max_target": "max_target",
-    "stored_state": "state_keys",
-}
-"""Settings of a loss, and what it calls them."""
-
-
-def check_loss(settings: LearnerSettings, loss: LossModule) -> None:
-    """Refuses settings that the loss was not built with: it would learn by its own.
-
-    Settings with their default are not looked at: a loss may have other ones of its own.
-
-    Args:
-        settings: of a learner.
-        loss: its loss.
-
-    Raises:
-        ValueError: if they differ.
-    """
-    for name, its in _OF_LOSSES.items():
-        asked, has = getattr(settings, name), getattr(loss, its, None)
-        if name == "stored_state":
-            has = bool(has)
-        forgets = name == "burn_in" and has == 0.0  # a network without memory
-        if asked not in (LearnerSettings.__dataclass_fields__[name].default, has, "unbounded") and not forgets:
-            raise ValueError(
-                f"settings.{name} must be that of the loss, which has {has}, got {asked}; build it with "
-                "make_recurrent_loss(network, settings), or give both the same."
-            )

@@ -45,7 +45,8 @@ class SubController(TensorDictModuleBase):
         hidden_key, cell_key: LSTM state ``[H]``.
         exploration_key: what the exploration carries, if anything.
         mask_key: actions that can be chosen ``[A]`` bool; ``None``: all of them.
-        option_keys: entries of the options that it pursues, whose outcome ``exploration`` may depend on.
+        option_keys: entries of the options that it pursues: what they are paid, where they end, and what became of
+            them, on which ``exploration`` may depend.
 
     Raises:
         ValueError: if network or ``exploration`` do not fit a flat or hierarchical agent.
@@ -191,7 +192,9 @@ class MetaController(TensorDictModuleBase):
         action_value_key: Q-values, written in learning.
         hidden_key, cell_key: LSTM state ``[H]``.
         exploration_key: what the exploration carries from option to option, if anything.
-        option_keys: entries of the options of the level above, whose outcome ``exploration`` may depend on.
+        option_keys: entries of the options of the level above: where they end, and what became of them, on which
+            ``exploration`` may depend.
+        return_key, steps_key: what its own options earned, and how long they took; read in learning.
 
     Raises:
         ValueError: if ``network`` and ``condition_key`` do not fit, nothing is read, or ``exploration`` repeats its
@@ -226,6 +229,8 @@ class MetaController(TensorDictModuleBase):
         cell_key: NestedKey = keys.META_CELL,
         exploration_key: NestedKey = keys.SUBGOAL_EXPLORATION,
         option_keys: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
+        return_key: NestedKey = keys.OPTION_RETURN,
+        steps_key: NestedKey = keys.OPTION_STEPS,
     ) -> None:
         super().__init__()
         if not input_keys or isinstance(input_keys, str):
@@ -249,6 +254,7 @@ class MetaController(TensorDictModuleBase):
         self.gate_key, self.active_subgoal_key = gate_key, active_subgoal_key
         self.action_value_key, self.hidden_key, self.cell_key = action_value_key, hidden_key, cell_key
         self.exploration_key, self.option_keys = exploration_key, option_keys
+        self.return_key, self.steps_key = return_key, steps_key
         self.writes_values = False
         """Whether acting, too, writes its Q-values; for those who watch."""
         self.state_keys: list[NestedKey] = [hidden_key, cell_key] if network.recurrent else []
@@ -273,8 +279,8 @@ class MetaController(TensorDictModuleBase):
             "action": self.subgoal_key,
             "action_value": self.action_value_key,
             "action_mask": self.mask_key,
-            "reward": keys.OPTION_RETURN,
-            "steps": keys.OPTION_STEPS,
+            "reward": self.return_key,
+            "steps": self.steps_key,
         }
 
     def make_tensordict_primer(self) -> TensorDictPrimer:

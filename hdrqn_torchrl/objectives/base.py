@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from operator import attrgetter
 from typing import Any, Literal
 
 import torch
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -94,7 +95,8 @@ class SequenceLoss(LossModule):
         super().__setstate__(state)
         for name, network in zip(self._registered, self._networks, strict=False):
             with self._modules[name].unlock_() as registered:
-                registered.update(TensorDict.from_module(network))
+                for key in list(registered.keys(True, True)):  # a target network holds tensors, not parameters
+                    registered.set(key, attrgetter(".".join((key,) if isinstance(key, str) else key))(network))
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
         """The keys are read at every call; nothing to pass on."""

@@ -81,7 +81,7 @@ def play(
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     observers: Sequence[Observer] = (),
     max_steps: int | None = None,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[], None] | None = None,
 ) -> TensorDictBase:
     """Plays episodes, in rounds of one per environment.
 
@@ -155,7 +155,7 @@ def evaluate(
     seed: int = 0,
     exploration_type: ExplorationType = ExplorationType.DETERMINISTIC,
     max_steps: int | None = None,
-    check: Callable[[], None] = lambda: None,
+    check: Callable[[], None] | None = None,
 ) -> dict[str, float]:
     """Plays episodes and averages them; arguments as in :func:`play`.
 
@@ -196,7 +196,7 @@ def _play_once(
     observers: Sequence[Observer],
     task: Task,
     max_steps: int | None,
-    check: Callable[[], None],
+    check: Callable[[], None] | None,
 ) -> TensorDictBase:
     """One episode in each environment, ``[N]``."""
     tensordict, tracker = env.reset(), EpisodeTracker(task, per_subgoal=True)
@@ -204,7 +204,8 @@ def _play_once(
     episodes: TensorDictBase | None = None
     longest = max_steps or task.max_steps or LONGEST_EPISODE
     for step in range(longest):
-        check()
+        if check is not None:
+            check()
         if step == PATIENCE and max_steps is None and task.max_steps is None:
             _ask_for_a_limit(playing)
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))

@@ -106,8 +106,8 @@ class CSVLog:
 class RunLogger:
     """Sends each log point to the CSV file, to TorchRL loggers and to the terminal.
 
-    A logger that fails (W&B without a network) is told of and misses that point: the file has all of them, and the
-    training goes on.
+    A logger that fails at a log point (W&B without a network) is told of and misses it: the file has all of them, and
+    the training goes on.
 
     Args:
         folder: run folder; it is made if it is not there.
@@ -189,7 +189,8 @@ class RunLogger:
             last = self.csv.last_frames()
             for logger in self.loggers:
                 if hasattr(logger, "go_back_to"):
-                    logger.go_back_to(last)
+                    with self._going_on_without(logger):
+                        logger.go_back_to(last)
             self._going = True
 
     def say(self, sentence: str) -> None:

@@ -252,6 +252,7 @@ class Trainer:
             row |= monitor.metrics()
         best = False
         if evaluation:
+            self._stop.check()
             result = self.evaluate()
             row |= {
                 f"greedy/{name.removesuffix('_mean').removesuffix('_rate')}": value for name, value in result.items()

@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from hdrqn_torchrl.analysis.claims import Near
+from hdrqn_torchrl.analysis.commits import commits_of
 from hdrqn_torchrl.cli import report, study_runs
 from hdrqn_torchrl.cli.command_line import command_line
 from hdrqn_torchrl.cli.configuration import CONF
@@ -215,6 +216,9 @@ def test_seeds_stand_in_the_order_of_numbers_and_commits_are_of_runs_that_count(
     (runs[0] / "run.json").write_text(json.dumps(origin | {"resumed_with": went_on}))
     with ExitStack() as stack:
         members = study_runs.read_runs([str(tmp_path)], stack)
+    for broken in ({"resumed_with": 3}, {"resumed_with": ["x", None]}, {"overrides": 3}):
+        assert study_runs.Found(members[0].entry, {}, broken).overridden == set()
+        assert commits_of({"commit": "0123456789", **broken}) == ["0123456789"]
     row = report.table_row("v2", members, "wall_seconds")
     assert row.startswith("| v2 | 9, 10 |") and row.endswith("| 0123456, 89abcde-dirty |")
 

@@ -25,8 +25,10 @@ from safetensors.torch import load_file
 from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
 from hdrqn_torchrl.cli import train, training
 from hdrqn_torchrl.cli.configuration import resolved
+from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.learning import Learner, LearnerSettings
 from hdrqn_torchrl.modules import compact_network
+from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import CSVLog
 from hdrqn_torchrl.runs.persistence.durable import verify
 from hdrqn_torchrl.runs.persistence.folder import locked
@@ -199,6 +201,17 @@ def test_worlds_of_which_most_of_a_training_sees_the_first_sequence_only_are_war
     assert training.late_learners(agent, 4 * first) == []
     (sentence,) = training.late_learners(agent, 4 * first - 1)
     assert f"learns nothing in the first {first:,} frames" in sentence and "use fewer worlds or more frames" in sentence
+
+
+def test_a_stop_request_cuts_evaluations_off(tmp_path):
+    settings = resolved(configure("env.num_envs=2", "evaluation.num_envs=2", "logger=csv"))
+    with StopRequest() as stop:
+        trainer, *_ = training.build_run(Plan(tmp_path, settings, {}, resumed=False), stop)
+        assert trainer.evaluate()["episodes"] >= 2
+        signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(Interrupted):
+            trainer.evaluate()
+    trainer.collector.shutdown()
 
 
 @pytest.mark.parametrize("question", [["--help"], ["--cfg", "job"], ["--cfg", "job", "algo=drqn"]], ids=" ".join)

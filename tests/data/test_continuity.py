@@ -5,6 +5,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import build, collect, make_collector, small_env
+from tensordict import TensorDict
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.envs import StepCounter, TransformedEnv
 from user_envs import Corridor
@@ -194,3 +195,10 @@ def test_steps_that_the_policy_did_not_take_are_refused(name):
     with pytest.raises(ValueError, match=r"policy must act in every step.* without init_random_frames"):
         algorithm.observe(next(iter(collector)))
     collector.shutdown()
+
+
+def test_a_memory_that_has_come_to_rest_in_mid_episode_is_accepted():
+    """Where all inputs are the same, it does; and a resumed training begins there."""
+    no, memory = torch.zeros(2, 3, 1, dtype=torch.bool), torch.ones(2, 3, 4)
+    batch = {"collector": {"traj_ids": torch.zeros(2, 3, dtype=torch.int64)}, "is_init": no, "next": {"done": no}}
+    Continuity(memory_key="memory").check(TensorDict(batch | {"memory": memory}, [2, 3]))

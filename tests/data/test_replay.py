@@ -14,6 +14,7 @@ from hdrqn_torchrl.data import (
     make_sequence_buffer,
     sample_sequences,
 )
+from hdrqn_torchrl.data.device_draws import DeviceDraws
 from hdrqn_torchrl.data.slices import episode_starts
 
 PADDED = ["steps", "episodes", "whole_episodes"]
@@ -500,3 +501,11 @@ def test_sequences_have_the_length_that_the_buffer_draws():
         drawn = sample_sequences(buffer)
         real = drawn["collector", "mask"].squeeze(-1)
         assert drawn.shape == (3, 6) and drawn["step"].diff(dim=1)[real[:, 1:]].eq(1).all()
+
+
+def test_draws_inside_a_graph_refuse_transforms():
+    buffer = make_sequence_buffer(16, slice_len=4, batch_size=3, num_envs=2)
+    buffer.append_transform(Transform())
+    draws = DeviceDraws(buffer, sequences=3, length=4)
+    with pytest.raises(ValueError, match=r"buffer must have no transforms .*, got 1: .* capture=False"):
+        draws.refresh()

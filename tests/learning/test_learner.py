@@ -798,6 +798,9 @@ class TestPrecision:
         ({"max_target": 2.0}, {"max_target": 1.0}, "max_target must be that of the loss, which has 1.0, got 2.0"),
         ({"stored_state": True}, {}, "stored_state must be that of the loss, which has False, got True"),
         ({"burn_in": 0.25}, {}, "burn_in must be that of the loss, which has 0.5, got 0.25"),
+        ({"burn_in": 0.75}, {"burn_in": 0.0}, "burn_in must be that of the loss, which has 0.0, got 0.75"),
+        ({"max_target": "unbounded"}, {"max_target": 1.0}, "max_target must be that of the loss, which has 1.0"),
+        ({"max_target": "unbounded"}, {}, None),
         ({"burn_in": 0.25, "n_step": 3, "double": False}, {"burn_in": 0.25, "n_step": 3, "double": False}, None),
         ({}, {"n_step": 3, "burn_in": 0.0}, None),  # a loss may have its own
     ],
@@ -820,7 +823,7 @@ def test_a_loss_that_was_built_with_other_settings_is_refused(settings, loss, me
     if message is None:
         make()
     else:
-        with pytest.raises(ValueError, match=f"settings.{message}; build it with make_recurrent_loss"):
+        with pytest.raises(ValueError, match=f"settings.{message}.*; build it with make_recurrent_loss"):
             make()
 
 
@@ -840,5 +843,8 @@ def test_a_copy_of_an_agent_learns_as_the_agent_does(name):
         assert any(not torch.equal(before[key], value) for key, value in each.policy.named_parameters())
         reports.append(torch.stack(losses))
     assert torch.equal(*reports) and len(reports[0].unique()) > 1
+    for level, learner in algorithm.learners.items():
+        theirs = copy.learners[level].loss.state_dict()
+        assert all(torch.equal(value, theirs[key]) for key, value in learner.loss.state_dict().items())
     for (key, one), other in zip(algorithm.policy.named_parameters(), copy.policy.parameters(), strict=True):
         assert torch.equal(one, other) and one is not other, key

@@ -1,4 +1,5 @@
 from copy import deepcopy
+from operator import attrgetter
 from types import SimpleNamespace
 
 import pytest
@@ -786,3 +787,24 @@ def test_choices_that_are_masked_in_acting_are_masked_in_targets():
 def test_a_loss_can_be_made_of_doubles():
     loss = RecurrentDQNLoss(make_controller().float()).double()
     assert {each.dtype for each in loss.parameters()} == {torch.float64}
+
+
+@pytest.mark.parametrize("level", ["flat", "sub", "meta"])
+def test_a_copy_of_a_loss_is_whole(level):
+    """What it registers is what its networks hold: all layers, of both networks."""
+    loss, _ = make_loss(level)
+    copy = deepcopy(loss)
+    before = {key: value.clone() for key, value in copy.target_value_network_params.flatten_keys(".").items()}
+    with torch.no_grad():
+        for parameter in copy.parameters():
+            parameter.add_(1.0)
+    SoftUpdate(copy, tau=0.5).step()
+    network, target = copy._networks
+    for key, value in copy.target_value_network_params.flatten_keys(".").items():
+        moved = key in dict(network.named_parameters())
+        assert (value != before[key]).any() == moved and attrgetter(key)(target) is value, key
+    for key, value in network.named_parameters():
+        assert copy.value_network_params.flatten_keys(".")[key] is value, key
+    copy.load_state_dict(loss.state_dict())
+    for key, value in before.items():
+        assert torch.equal(attrgetter(key)(target), value), key

@@ -120,7 +120,16 @@ def build_env(settings: RunSettings, changes: Mapping[str, Any], allowed: Sequen
 
 
 def build_evaluation_env(settings: RunSettings, changes: Mapping[str, Any], allowed: Sequence[str] = ()) -> EnvBase:
-    """The bare environment of its evaluations: ``evaluation.env`` goes before other changes."""
+    """The bare environment of a run's evaluations; ``evaluation.env`` wins over other changes.
+
+    Args:
+        settings: all of them.
+        changes: settings of the environment that are to differ from the run's.
+        allowed: see :func:`build`.
+
+    Raises:
+        SettingsError: as :func:`build`; what ``evaluation.env`` says is named so.
+    """
     with _changes_named(settings):
         return build_env(settings, {**changes, **settings.evaluation.env}, allowed)
 

@@ -47,6 +47,9 @@ class Replay:
 
     Raises:
         ValueError: if a setting breaks its rule.
+
+    Examples:
+        See :class:`~hdrqn_torchrl.learning.Learner`, whose ``replay`` it is.
     """
 
     def __init__(
@@ -93,7 +96,11 @@ class Replay:
         self._has_warned = self._could_draw = False
 
     def store(self, transitions: TensorDictBase | None) -> None:
-        """Stores what a batch had of transitions, if it had any; minibatches drawn before are drawn anew."""
+        """Stores transitions; minibatches drawn before are drawn anew.
+
+        Args:
+            transitions: ``[N, T]`` (steps) or ``[M]`` (options); ``None``: there were none in a batch.
+        """
         self._drawn = []
         if transitions is not None:
             self.buffer.extend(transitions)
@@ -123,7 +130,11 @@ class Replay:
         return sample if self.refresh is None else self.refresh(sample)
 
     def rewrite(self, change: Callable[..., None]) -> None:
-        """Changes what is stored (:meth:`SequenceBuffer.rewrite`); minibatches drawn before are drawn anew."""
+        """Changes what is stored; minibatches drawn before are drawn anew.
+
+        Args:
+            change: as of :meth:`~hdrqn_torchrl.data.SequenceBuffer.rewrite`.
+        """
         self.buffer.rewrite(change)
         self._drawn = []
 
