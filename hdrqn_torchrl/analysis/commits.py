@@ -22,14 +22,14 @@ def commits_of(origin: dict[str, Any]) -> list[str]:
     return list(dict.fromkeys(str(part.get("commit")) for part in parts))
 
 
-def shortened(commit: str) -> str:
+def short_commit(commit: str) -> str:
     """A commit's first digits, and whether files were changed after it.
 
     Args:
         commit: as ``git describe --always --dirty`` names it.
 
     Examples:
-        >>> shortened("89abcdef01-dirty")
+        >>> short_commit("89abcdef01-dirty")
         '89abcde-dirty'
     """
     name, dirty, _ = commit.partition("-dirty")

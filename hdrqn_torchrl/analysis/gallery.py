@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from hdrqn_torchrl.analysis.commits import shortened
+from hdrqn_torchrl.analysis.commits import short_commit
 from hdrqn_torchrl.runs.cards import Card
 from hdrqn_torchrl.runs.persistence import layout
 
@@ -29,7 +29,7 @@ def row(card: Card) -> str:
     """Line of the table."""
     cells = (
         *(f"[{card.name}](#{card.name})", card.task, card.algo, f"{card.frames / 1000:.0f}k", card.seed),
-        ", ".join(map(shortened, card.commit.split(", "))),
+        ", ".join(map(short_commit, card.commit.split(", "))),
         *(shown(card, "return_mean"), shown(card, "success_rate", "{:.1%}"), shown(card, "steps_mean", "{:.1f}")),
         card.episodes,
     )

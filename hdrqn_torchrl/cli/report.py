@@ -28,8 +28,7 @@ from omegaconf import MISSING
 from PIL import Image
 
 from hdrqn_torchrl.analysis.claims import Results
-from hdrqn_torchrl.analysis.commits import commits_of
-from hdrqn_torchrl.analysis.commits import shortened as short
+from hdrqn_torchrl.analysis.commits import commits_of, short_commit
 from hdrqn_torchrl.analysis.comparison import plot_curves
 from hdrqn_torchrl.analysis.estimates import Group, TaskResults, estimate_curves, estimate_finals
 from hdrqn_torchrl.analysis.figures import plot_legs_over_time
@@ -237,7 +236,7 @@ def table_row(label: str, members: list[Found], clock: str) -> str:
 
 def commits_in(members: list[Found]) -> str:
     """Commits of the code that made the runs."""
-    return ", ".join(sorted({short(commit) for each in members for commit in commits_of(each.origin)}))
+    return ", ".join(sorted({short_commit(commit) for each in members for commit in commits_of(each.origin)}))
 
 
 def evaluations_of(folder: Path) -> list[dict[str, Any]]:

@@ -16,7 +16,6 @@ from torchrl.modules import recurrent_mode
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.envs.symmetry import Symmetry
 from hdrqn_torchrl.modules.all_subgoals_network import AllSubgoalsNetwork
-from hdrqn_torchrl.modules.controllers import first_state
 from hdrqn_torchrl.modules.exploration import EpsilonGreedy, carried_by, choose
 from hdrqn_torchrl.modules.exploration_checks import (
     check_chooses_subgoals,
@@ -24,6 +23,7 @@ from hdrqn_torchrl.modules.exploration_checks import (
     check_two_schedules,
     exploration_or_greedy,
 )
+from hdrqn_torchrl.modules.recurrent_state import first_state
 from hdrqn_torchrl.modules.symmetric_mean import SymmetricMean
 
 

@@ -11,8 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch.nn import ModuleList
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.modules.controllers import MetaController, SubController
 from hdrqn_torchrl.modules.exploration_checks import check_two_schedules
+from hdrqn_torchrl.modules.meta_controller import MetaController
+from hdrqn_torchrl.modules.sub_controller import SubController
 
 
 class HierarchicalPolicy(TensorDictModuleBase):
