@@ -7,6 +7,16 @@ from typing import Any
 _LENGTH = 7
 
 
+def codes_of(origin: dict[str, Any]) -> list[dict[str, Any]]:
+    """What is recorded of the code of a run, each with ``commit`` and ``versions``: that it began with, then others.
+
+    Args:
+        origin: what ``run.json`` holds; the first of the list is this itself.
+    """
+    later = origin.get("resumed_with")
+    return [origin, *(each for each in (later if isinstance(later, list) else []) if isinstance(each, dict))]
+
+
 def commits_of(origin: dict[str, Any]) -> list[str]:
     """Commits of a run, from its ``run.json``: what it began with, then what it went on with.
 
@@ -17,9 +27,7 @@ def commits_of(origin: dict[str, Any]) -> list[str]:
         >>> commits_of({"commit": "0123456789", "resumed_with": [{"commit": "89abcdef01-dirty"}]})
         ['0123456789', '89abcdef01-dirty']
     """
-    later = origin.get("resumed_with")
-    parts = [origin, *(each for each in (later if isinstance(later, list) else []) if isinstance(each, dict))]
-    return list(dict.fromkeys(str(part.get("commit")) for part in parts))
+    return list(dict.fromkeys(str(code.get("commit")) for code in codes_of(origin)))
 
 
 def short_commit(commit: str) -> str:

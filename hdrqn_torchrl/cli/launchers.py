@@ -60,7 +60,7 @@ class Job:
         sweeps.begin_elsewhere()
         os.chdir(self.config.hydra.runtime.cwd)
         config = self._composed(self.overrides)
-        if was_started(config, self.number) and any((each / layout.CONFIG).exists() for each in _folders(config)):
+        if was_started(config.hydra, self.number) and any((each / layout.CONFIG).exists() for each in _folders(config)):
             config = self._composed([*self.overrides, "resume=auto"])
         return run_job(
             hydra_context=self.context, task_function=self.task, config=config,

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from omegaconf import DictConfig
+from hydra.conf import HydraConf
 
 try:
     import fcntl
@@ -25,19 +25,23 @@ REMEDY = "the same command with resume=auto goes on, with jobs that were not sta
 Note = dict[str, Any]
 
 
-def write_note(ledger: Path, config: DictConfig, folder: str, state: str) -> None:
-    """Adds a line about the job of ``config``.
+def write_note(ledger: Path, hydra: HydraConf, state: str, folder: Path | None = None) -> None:
+    """Adds a line about a job.
 
     Args:
         ledger: the file.
-        config: of the job.
-        folder: of its run.
+        hydra: what Hydra knows of the job.
         state: :data:`STARTED`, :data:`DONE`, or why it ended.
+        folder: of its run; by default what the last note about the job says, or else what Hydra made for it.
     """
+    job, cwd = hydra.job.num, hydra.runtime.cwd
+    if folder is None:
+        known = [note["folder"] for note in read_ledger(ledger) if note["job"] == job]
+        folder = Path(known[0]) if known else Path(hydra.sweep.dir, hydra.sweep.subdir)
     note = {
-        "job": config.hydra.job.num,
-        "folder": os.path.relpath(folder, config.hydra.runtime.cwd),
-        "overrides": list(config.hydra.overrides.task),
+        "job": job,
+        "folder": os.path.relpath(Path(cwd, folder), cwd),
+        "overrides": list(hydra.overrides.task),
         "state": state,
     }
     with ledger.open("a+b") as file, _alone(file):
@@ -47,14 +51,14 @@ def write_note(ledger: Path, config: DictConfig, folder: str, state: str) -> Non
         file.flush()
 
 
-def ledger_of(config: DictConfig) -> Path:
+def ledger_of(hydra: HydraConf) -> Path:
     """Where the notes of a sweep are."""
-    return Path(config.hydra.sweep.dir) / "jobs.jsonl"
+    return Path(hydra.sweep.dir) / "jobs.jsonl"
 
 
-def was_started(config: DictConfig, job: int) -> bool:
+def was_started(hydra: HydraConf, job: int) -> bool:
     """Whether this sweep began a job before."""
-    return any(note["job"] == job for note in read_ledger(ledger_of(config)))
+    return any(note["job"] == job for note in read_ledger(ledger_of(hydra)))
 
 
 def read_ledger(ledger: Path) -> list[Note]:

@@ -12,6 +12,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from hdrqn_torchrl.analysis.commits import codes_of
 from hdrqn_torchrl.cli.resuming import Plan
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.settings.run_settings import as_plain
@@ -48,11 +49,11 @@ def _went_on(path: Path, code: dict[str, Any]) -> dict[str, Any] | None:
 
     try:
         origin = read_json(path)
-        parts = [origin, *origin.get("resumed_with", [])]
-        last = {name: parts[-1].get(name) for name in code}
-    except (OSError, ValueError, TypeError, AttributeError):
+        known = codes_of(origin)
+    except (OSError, ValueError, AttributeError):
         return None  # nobody needs it to go on
-    return None if last == code else origin | {"resumed_with": [*parts[1:], code]}
+    last = {name: known[-1].get(name) for name in code}
+    return None if last == code else origin | {"resumed_with": [*known[1:], code]}
 
 
 def _commit() -> str | None:

@@ -104,7 +104,7 @@ def run(settings: Settings) -> None:
 
 def tell_of_others(study: Study, matched: Matched) -> None:
     """Names runs that would stand for a job if another did not."""
-    if others := [str(run.entry.run.folder) for run in matched.passed_over]:
+    if others := [run.name for run in matched.passed_over]:
         note(f"note: {study.name}: left out for runs of the same settings ({len(others)}): {shortened(others)}")
 
 

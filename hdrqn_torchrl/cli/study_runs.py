@@ -35,6 +35,8 @@ class Found:
     """``run.json``"""
     place: int = 0
     """Which of the places that were named it lies in, the last one if several."""
+    name: str = ""
+    """Its folder, or its archive and the folder in it."""
 
     @property
     def overridden(self) -> set[str]:
@@ -61,7 +63,7 @@ class Matched:
 
 def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
     """All runs below folders and in archives; archives are unpacked for as long as ``stack`` lasts."""
-    places = []
+    places, unpacked_from = [], {}
     for pattern in patterns:
         if pattern.endswith(ARCHIVE):
             unpacked = stack.enter_context(tempfile.TemporaryDirectory())
@@ -69,6 +71,7 @@ def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
                 unpack(Path(pattern), Path(unpacked))
             except (OSError, EOFError, ValueError, lzma.LZMAError, tarfile.TarError) as error:
                 raise SettingsError(f"runs must name folders or readable archives, got {pattern}: {error}.") from error
+            unpacked_from[Path(unpacked)] = pattern
             pattern = unpacked
         places.append(pattern)
     lies_in = {folder: number for number, place in enumerate(places) for folder in find_runs([place])}
@@ -82,8 +85,16 @@ def read_runs(patterns: list[str], stack: ExitStack) -> list[Found]:
                 continue
             origin = origin if isinstance(origin, dict) else {}
             settings = flat(entry.settings, without=NOT_LEARNED_FROM)
-            found.append(Found(entry, settings, origin, lies_in[entry.run.folder]))
+            name = _name_of(entry.run.folder, unpacked_from)
+            found.append(Found(entry, settings, origin, lies_in[entry.run.folder], name))
     return found
+
+
+def _name_of(folder: Path, unpacked_from: dict[Path, str]) -> str:
+    for place, archive in unpacked_from.items():
+        if folder.is_relative_to(place):
+            return f"{archive}: {folder.relative_to(place)}"
+    return str(folder)
 
 
 def runs_of_jobs(experiment: str, size: str, runs: list[Found]) -> Matched:
@@ -136,7 +147,7 @@ def keep_runs(runs: list[Found], archive: Path) -> None:
         for size in study.sizes
         for _, run in runs_of_jobs(study.name, size, runs).runs
     }
-    if others := [str(run.entry.run.folder) for run in runs if run.entry.run.folder not in used]:
+    if others := [run.name for run in runs if run.entry.run.folder not in used]:
         note(f"note: not in {archive} ({len(others)} runs that no study has now): {shortened(others)}")
     ordered = sorted(used.values(), key=lambda run: sorted(map(str, run.settings.items())))
     keep([run.entry.run.folder for run in ordered], archive)

@@ -60,7 +60,7 @@ class Sweep(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """In the main process, before all jobs."""
-        ledger = ledger_of(config)
+        ledger = ledger_of(config.hydra)
         self.ledger = ledger.absolute()  # jobs may have other working directories
         self.ledger.unlink(missing_ok=True)
         share_gpu(config)
@@ -103,18 +103,24 @@ class Sweep(Callback):
     def _note(self, config: DictConfig, state: str) -> None:
         assert self.ledger is not None
         if not _stop.orphaned:  # else the same command may have been started again: the ledger belongs to that sweep
-            write_note(self.ledger, config, config.hydra.runtime.output_dir, state)
+            write_note(self.ledger, config.hydra, state)
+
+
+def note_folder(folder: Path) -> None:
+    """Notes where this process's job of a sweep is done, as it may go on with a run of an earlier sweep."""
+    if is_sweep():
+        write_note(ledger_of(HydraConfig.get()), HydraConfig.get(), STARTED, folder)
 
 
 def note_lost(config: DictConfig, error: Exception) -> JobReturn:
     """The result of a job that left none, which is noted unless it could tell itself how it ended."""
-    ledger, reason = ledger_of(config), one_line(error)
+    ledger, reason = ledger_of(config.hydra), one_line(error)
     states = {note["job"]: note["state"] for note in read_ledger(ledger)}
     state = states.get(config.hydra.job.num, STARTED)
     if state == STARTED:
         if was_stopped() and config.hydra.job.num not in states:
             reason = NOT_STARTED
-        write_note(ledger, config, f"{config.hydra.sweep.dir}/{config.hydra.sweep.subdir}", reason)
+        write_note(ledger, config.hydra, reason)
         sys.stderr.write(f"job {config.hydra.job.num}: {reason}\n")
     return _fail(JobReturn(status=JobStatus.FAILED), config, reason)
 

@@ -54,6 +54,8 @@ def composed(config: DictConfig) -> float:
             with results_alone():
                 return train_together(runs, pieces)
         run = plan(settings, folder)
+        if run.folder != folder:
+            sweeps.note_folder(run.folder)
         with results_alone():
             return train(run)
     except KeyboardInterrupt as stop:

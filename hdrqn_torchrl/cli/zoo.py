@@ -28,9 +28,9 @@ import shutil
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 
+from hdrqn_torchrl.cli import watch as watching
 from hdrqn_torchrl.cli.command_line import check_place, command_line
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.runs.persistence import layout
@@ -105,15 +105,15 @@ def copy(settings: Settings) -> None:
 
 def watch(settings: Settings) -> None:
     """Records an agent, with the program that does so for runs."""
-    given = {
-        "run": folder_of(settings),
-        "out": settings.out or "episode.gif",
-        "episodes": settings.episodes or 3,
-        "seed": settings.seed,
-        "allowed_targets": f"[{','.join(settings.allowed_targets)}]",
-    }
-    sys.argv[1:] = [f"{key}={value}" for key, value in given.items()]
-    import_module("hdrqn_torchrl.cli.watch").main()
+    watching.run(
+        watching.Settings(
+            run=str(folder_of(settings)),
+            out=settings.out or watching.Settings.out,
+            episodes=settings.episodes or watching.Settings.episodes,
+            seed=settings.seed,
+            allowed_targets=settings.allowed_targets,
+        )
+    )
 
 
 def add(settings: Settings) -> None:

@@ -45,7 +45,8 @@ class Begun:
         (folder / "sweep").mkdir()
 
     def note(self, job):
-        (self.folder / "sweep" / "jobs.jsonl").write_text(json.dumps({"job": job, "state": "started"}) + "\n")
+        note = {"job": job, "folder": "sweep/0-gridworld-hdqn-seed3", "state": "started"}
+        (self.folder / "sweep" / "jobs.jsonl").write_text(json.dumps(note) + "\n")
 
     def run(self):
         return launchers.Job(self.launcher, 0, ["algo=hdqn", "seed=3"])().return_value

@@ -169,6 +169,10 @@ def test_runs_that_are_left_out_for_others_are_named(run, outputs, tmp_path, mon
     make_run(tmp_path / "new/dqn", "experiment=gridworld", "algo=dqn", "seed=0", score=5.0)
     run("runs=[outputs,new]", "out=a.md", "studies=gridworld")
     assert told == ["note: gridworld: left out for runs of the same settings (1): outputs/dqn-seed0"]
+    run("runs=outputs", "out=a.md", "studies=gridworld", "keep=kept/runs.tar.xz")
+    told.clear()
+    run("runs=[kept/runs.tar.xz,new]", "out=a.md", "studies=gridworld")
+    assert len(told) == 1 and re.search(r" \(1\): kept/runs\.tar\.xz: [\w-]+$", told[0])
 
 
 @text_only

@@ -431,10 +431,13 @@ class TestRecord:
 
     def test_an_origin_that_says_nothing_does_not_keep_a_run_from_going_on(self):
         run = make_run("outputs/a/1", "total_frames=100")
-        for content in ("[]", "{", '{"choices": {"algo": "v2"}, "resumed_with": 3}'):
+        for content in ("[]", "{"):
             (run / "run.json").write_text(content)
             record(plan_for(f"resume={run}"))
             assert (run / "run.json").read_text() == content
+        (run / "run.json").write_text('{"choices": {"algo": "v2"}, "resumed_with": 3}')
+        record(plan_for(f"resume={run}"))
+        assert len(json.loads((run / "run.json").read_text())["resumed_with"]) == 1
 
     def test_without_git_no_commit_is_recorded(self, monkeypatch):
         monkeypatch.setenv("PATH", "")

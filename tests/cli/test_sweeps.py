@@ -93,6 +93,19 @@ def test_a_serial_sweep_gives_the_same_and_survives_failed_jobs(parallel, tmp_pa
     assert rows_of(tmp_path, 1) == rows_of(parallel[0], 0)
 
 
+def test_a_job_that_goes_on_is_noted_with_the_folder_of_its_run(tmp_path):
+    arguments = ["-m", *(each for each in COMMON if not each.startswith("hydra.")), "output_root=runs"]
+    for more in ((), ("resume=auto",)):
+        code, *_ = run_script(tmp_path, *arguments, *more)
+        assert code == 0
+    (run,) = tmp_path.glob("runs/*/0-*")
+    ledgers = list(tmp_path.glob("runs/*/jobs.jsonl"))
+    assert len(ledgers) == 2
+    for path in ledgers:
+        (note,) = ledger.read_ledger(path)
+        assert note["folder"] == str(run.relative_to(tmp_path)) and note["state"] == ledger.DONE
+
+
 def test_a_search_maximises_and_survives_failed_trials(tmp_path):
     # Without -m: sweep=search alone says that this is a sweep.
     search = ["sweep=search", "hydra.sweeper.n_trials=4", "algo.gamma=choice(0.9,7)", "algo.sub.tau=0.02"]
@@ -196,7 +209,7 @@ def job_config(folder, *, number=0, sweeper="hydra._internal.core_plugins.basic_
         "runtime": {"output_dir": str(folder / f"job{number}"), "cwd": str(folder)},
         "overrides": {"task": list(overrides)},
         "sweeper": {"_target_": sweeper},
-        "sweep": {"dir": str(folder)},
+        "sweep": {"dir": str(folder), "subdir": f"job{number}"},
         "launcher": {"_target_": "hydra._internal.core_plugins.basic_launcher.BasicLauncher"},
     }
     return OmegaConf.create({"hydra": hydra})
