@@ -83,10 +83,10 @@ def relabel_subgoals(
 
     reached = attained.gather(-1, subgoal)
     terminated = reached | after.get(keys.TERMINATED)
-    cut = after.get(option_done_key) & ~attained.gather(-1, pursued) & left.gather(-1, pursued)
+    stays = left & torch.cat([left[:, 1:], torch.ones_like(left[:, :1])], 1)
+    cut = after.get(option_done_key) & ~attained.gather(-1, pursued) & stays.gather(-1, pursued)
     eligible = left.gather(-1, subgoal)
-    lost = ~eligible | torch.cat([~eligible[:, 1:], torch.zeros_like(eligible[:, :1])], 1)
-    done = terminated | cut | lost | after.get(keys.DONE)
+    done = terminated | cut | ~stays.gather(-1, subgoal) | after.get(keys.DONE)
     init = torch.cat([told.get(option_init_key)[:, :1], done[:, :-1]], 1)
     reward = rewards.of(attained, reached, None if hazard_key is None else after.get(hazard_key))
     for part, key, value in (

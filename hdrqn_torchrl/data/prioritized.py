@@ -17,6 +17,7 @@ from hdrqn_torchrl.data.slices import episode_starts, padded_slices, steps_left
 PriorityStarts = Literal["steps", "episode_starts", "whole_episodes"]
 FLOOR = 1e-3
 """Added to priorities: keeps sequences without error in play."""
+_TINY = torch.finfo(torch.float32).tiny
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,14 +152,24 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
                 f"no stored step begins a complete sequence of slice_len={self.slice_len} steps; update later, raise "
                 "capacity or use shorter slices."
             )
-        self._rng = self._rng or torch.default_generator  # TorchRL's own choice is NumPy's
-        drawn, _ = super().sample(storage, batch_size // self.slice_len)
-        start = torch.stack(drawn, -1) if isinstance(drawn, tuple) else drawn.unsqueeze(-1)  # [B, ndim]
-        place = places_of(start, storage).cpu()
-        weight = torch.as_tensor(self._sum_tree[place]) ** -self._beta
-        start, place = start.to(left.device), place.to(left.device)
+        place, priority = self._draw(batch_size // self.slice_len, steps=left.numel())
+        weight, place = priority**-self._beta, place.to(left.device)
+        start = torch.stack(torch.unravel_index(place, storage.shape[: storage.ndim]), -1)  # [B, ndim]
         index, info = padded_slices(start, left.flatten()[place], self.slice_len, rows=storage.shape[0])
         return index, {**info, "priority_weight": weight.repeat_interleave(self.slice_len)}
+
+    def _draw(self, number: int, *, steps: int) -> tuple[Tensor, Tensor]:
+        """Places of starts among the first ``steps``, and their priorities, ``[number]`` each.
+
+        TorchRL's own draw fails where the random number is 0, once in 2**24, and no sequence begins at place 0.
+        """
+        mass = torch.rand(number, generator=self._rng) * self._sum_tree.query(0, steps)
+        place = torch.as_tensor(self._sum_tree.scan_lower_bound(mass.clamp_(min=_TINY))).clamp_(max=steps - 1)
+        priority = torch.as_tensor(self._sum_tree[place])
+        while not priority.all():  # rounding led behind the last start
+            place = torch.where(priority == 0, place - 1, place)
+            priority = torch.as_tensor(self._sum_tree[place])
+        return place, priority
 
     def can_sample(self, storage: Storage) -> bool:
         """Whether a complete sequence begins in a storage that is not empty."""

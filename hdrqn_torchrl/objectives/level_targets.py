@@ -140,18 +140,18 @@ class LevelTargets:
         tensordict: TensorDictBase,
         events: StepEvents,
     ) -> Columns:
-        """Levels above the first: unless x was attained, its option goes on; ``agrees`` is ``[B, T + 1, X]``."""
+        """Levels above the first: unless x was attained or lost, its option goes on; ``agrees``: ``[B, T + 1, X]``."""
         assert rule.choices is not None
         steps, names = tensordict[:, :-1], rule.choices
         best = double_q_value(online if self.double else target, target, _mask(rule, tensordict))[:, 1:].unsqueeze(-1)
-        attained = steps["next", names.attained].unsqueeze(-2)  # [B, T, 1, X]
+        over = (steps["next", names.attained] | ~tensordict[names.subgoal_mask][:, 1:]).unsqueeze(-2)  # [B, T, 1, X]
         pursued = _pursued(names, steps)
         may_learn = agrees[:, :-1] | pursued
         if not self.all_subgoals:
             may_learn = may_learn & pursued
         if self.intra_option:
-            following = torch.where(attained, best, target[:, 1:])
-            trace = watkins_trace(agrees, self.trace_decay)[:, :-1].unsqueeze(-2).masked_fill(attained, 0.0)
+            following = torch.where(over, best, target[:, 1:])
+            trace = watkins_trace(agrees, self.trace_decay)[:, :-1].unsqueeze(-2).masked_fill(over, 0.0)
         else:
             whole = _ends_in_sequence(names, tensordict, events)
             may_learn = may_learn & pursued & steps[names.option_init] & whole.unsqueeze(-1)
@@ -172,16 +172,21 @@ class LevelTargets:
         tensordict: TensorDictBase,
         events: StepEvents,
     ) -> Columns:
-        """Adds what depends only on the pursued subgoal: reward, end, and which subgoals learn; ``[B, T, C, X]``."""
+        """Adds what depends only on the pursued subgoal: reward, end, and which subgoals learn; ``[B, T, C, X]``.
+
+        A step after which c can't be pursued any more, though it was not attained, has no target: nothing is trained
+        for c there.
+        """
         steps = tensordict[:, :-1]
-        reward, ended = events.reward, events.terminated.unsqueeze(-1)
+        reward, ended, unseen = events.reward, events.terminated.unsqueeze(-1), events.unseen.unsqueeze(-1)
         if rule.pursues is not None and rule.rewards is not None:
             attained = steps["next", rule.pursues.attained]  # [B, T, C]
             reward, ended = rule.rewards.of_all(attained, events.hazard), ended | attained
+            unseen = unseen | ~tensordict[rule.pursues.subgoal_mask][:, 1:]
             trained = trained & steps[rule.pursues.subgoal_mask].unsqueeze(-1)
             if not self.all_subgoals:
                 trained = trained & _pursued(rule.pursues, steps).unsqueeze(-1)
-        unseen = events.unseen.unsqueeze(-1) & ~ended
+        unseen = unseen & ~ended
         trace = trace.masked_fill(events.unseen[..., None, None], 0.0)
         trace[:, :-1].masked_fill_(unseen[:, 1:].unsqueeze(-1), 0.0)  # the next step has no target
         shape = following.shape

@@ -161,8 +161,8 @@ class SubgoalTransform(Transform):
         if self.max_option_steps is not None:
             done = done | (steps >= self.max_option_steps)
         if self.available_key is not None or not self.repeatable:
-            done = done | ~mask.gather(-1, chosen)
-            mask = mask & ~attained if self.available_key is None else next_tensordict.get(self.available_key).clone()
+            left = mask & ~attained if self.available_key is None else next_tensordict.get(self.available_key).clone()
+            done, mask = done | ~(mask & left).gather(-1, chosen), left
 
         for key, value in (
             (self.option_init_key, done),

@@ -119,6 +119,13 @@ class TestRelabelSubgoals:
                 {"pursued": "000000", "reward": [0.0] * 6, "init": "0234", "done": "123", "terminated": "",
                  "eligible": "0145"},
             ),
+            # The subgoal that was pursued can't be chosen for a while: that ends its option, but none for goal 0.
+            (
+                {"pursued": "1110", "attained": "00 00 00 00", "mask": "11 11 10 10", "init": "02", "done": "12",
+                 "reward": [0.0] * 4},
+                {"pursued": "0000", "reward": [0.0] * 4, "init": "0", "done": "", "terminated": "",
+                 "eligible": "0123"},
+            ),
             # Options cut by a time limit of two steps are cut for goal 1, too, and not terminated.
             (
                 {"pursued": "0000", "attained": "00 00 00 00", "mask": "11 11 11 11", "init": "02", "done": "13",

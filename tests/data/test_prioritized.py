@@ -208,6 +208,18 @@ class TestNewSteps:
         assert (weight == weight[0]).all() and weight[0].item() == pytest.approx((100 + FLOOR) ** (-ALPHA * 0.6))
 
 
+@pytest.mark.parametrize("sampling", SAMPLINGS)
+def test_a_random_number_of_zero_draws_the_first_start(sampling, monkeypatch):
+    """float32 has it once in 2**24 numbers."""
+    world = World(sampling, num_envs=1, rows=12, seed=4)
+    world.extend(19)
+    first = min(world.complete())
+    assert first != (0, 12)  # at place 0 of the ring
+    rand = torch.rand
+    monkeypatch.setattr(torch, "rand", lambda *size, **settings: rand(*size, **settings) * 0)
+    assert set(starts_of(world.sample())) <= set(world.complete())
+
+
 class TestRows:
     """Storages of one dimension: options, whole episodes in one piece."""
 

@@ -140,6 +140,14 @@ class Reference:
         """Whether choice x of a level was attained in a step; actions always are."""
         return level == 0 or bool(self.td["next", self.names[level - 1].attained][b, t, x])
 
+    def lost(self, level, x, b, t):
+        """Whether choice x of a level can't be chosen after a step any more, though it was not attained."""
+        gone = level > 0 and not self.td[self.names[level - 1].subgoal_mask][b, t + 1, x]
+        return gone and not self.attained(level, x, b, t)
+
+    def over(self, level, x, b, t):
+        return self.attained(level, x, b, t) or self.lost(level, x, b, t)
+
     def agrees(self, level, x, b, t):
         """Whether choice x of a level agrees with a step."""
         if level == 0:
@@ -166,21 +174,22 @@ class Reference:
         return self.s["meta_gamma" if level == self.levels - 1 else "middle_gamma"]
 
     def value(self, level, c, x, b, t):
-        """U at step ``t``, which followed a step that did or did not attain x."""
+        """U at step ``t``, which followed a step that did or did not attain or lose x."""
         chooser = self.q if self.s["double"] else self.target
-        if self.attained(level, x, b, t - 1):
+        if self.over(level, x, b, t - 1):
             x = self.best(chooser, level, c, b, t)
         return self.target[level][b * T + t, c, x].item()
 
     def unknown(self, level, c, b, t):
-        return self.cut_off(b, t) and not self.ends(level, c, b, t)
+        lost = level < self.levels - 1 and self.lost(level + 1, c, b, t)
+        return (self.cut_off(b, t) or lost) and not self.ends(level, c, b, t)
 
     def y(self, level, c, x, b, t):
         reward = self.reward(level, c, b, t)
         if self.ends(level, c, b, t):
             return reward
         value = self.value(level, c, x, b, t + 1)
-        lasts = level == 0 or not self.attained(level, x, b, t)
+        lasts = level == 0 or not self.over(level, x, b, t)
         if lasts and t + 1 < T - 1 and not self.unknown(level, c, b, t + 1):
             # At level 0 "the next action is the greedy one for c"; above "the next step is what x would do".
             follower = self.best(self.q, 0, c, b, t + 1) if level == 0 else x
@@ -334,6 +343,36 @@ def test_targets_count_on_no_action_that_cannot_be_chosen():
     for table, value, targets in zip(main, ([1.0, 0.0], [0.0, 0.0], [0.0, 0.0]), wanted, strict=True):
         gradient = [now - y for now, y in zip(value, targets, strict=True)] + [0.0]
         assert table.grad.sum((1, 2)).tolist() == pytest.approx(gradient, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("lost", "sub", "middle", "meta"),
+    [
+        # After the first step the near subgoal can't be pursued, so nothing says what either step is worth for it, nor
+        # what the second is worth for the middle level if it chooses it; it chooses the other one: 0.5 * 0.9.
+        ("near", [None, None], [0.5 * 0.9, None], [1.5, 2.0]),
+        ("", [0.3, 0.4], [None, None], [0.5 * 5.0, None]),
+    ],
+)
+def test_an_option_whose_subgoal_is_lost_is_followed_by_the_best_that_is_left(lost, sub, middle, meta):
+    """Two subgoals of each set, of which the second is never pursued; as in the row "000" above otherwise."""
+    td, names = three_levels("000")
+    for each in names:
+        td[each.subgoal_mask] = torch.ones(1, 3, 2, dtype=torch.bool)
+        td["next", each.attained] = torch.zeros(1, 3, 2, dtype=torch.bool)
+    td[OptionKeys(lost).subgoal_mask][0, 1, 0] = False
+    policy = AllSubgoalsPolicy(Tables([2, 2], actions=2, steps=3), subgoal_keys=names)
+    loss = AllSubgoalsLoss(policy, sub_gamma=0.5, meta_gamma=0.5, trace_decay=0.5, all_subgoals=False)
+    main, target = tables(loss)
+    values = ([1.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.8, 8.0], [0.6, 0.9], [4.0, 5.0])
+    with torch.no_grad():
+        for table, value in zip([*main, *target], values, strict=True):
+            table.copy_(torch.tensor(value).expand_as(table))
+    loss(td)["loss"].backward()
+    for table, value, wanted in zip(main, (1.0, 0.0, 0.0), (sub, middle, meta), strict=True):
+        count = max(1, sum(y is not None for y in wanted))
+        gradient = [0.0 if y is None else 2 * (value - y) / count for y in wanted] + [0.0]
+        assert table.grad[:, 0, 0].tolist() == pytest.approx(gradient, abs=1e-6)
 
 
 class TestFlat:

@@ -3,7 +3,8 @@ from functools import partial
 import pytest
 import torch
 from helpers import AGENT, CORRIDOR, LEFT, OBJECTS, RIGHT, small_env, subgoal_env
-from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.data import Binary
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, Transform, TransformedEnv
 from torchrl.envs.transforms import RenameTransform
 from torchrl.envs.utils import check_env_specs, step_mdp
 
@@ -122,6 +123,27 @@ class TestArguments:
         steps = play([0, 0, 0], actions=[RIGHT, RIGHT, LEFT], repeatable=repeatable)
         assert steps[-1]["option_done"].item() == done
         assert steps[-1]["subgoal_mask"].tolist() == [[repeatable, True]]
+
+    def test_an_option_ends_with_the_step_after_which_its_subgoal_is_not_available(self):
+        class Availability(Transform):
+            """Of goal 1 before the corridor's second step; nothing is attained."""
+
+            def _step(self, _, after):
+                self.time += 1
+                return after.set("available", torch.tensor([[True, self.time < 2]]))
+
+            def _reset(self, _, after):
+                self.time = 0
+                return after.set("available", torch.ones(1, 2, dtype=torch.bool))
+
+            def transform_observation_spec(self, spec):
+                spec["available"] = Binary(shape=(1, 2), dtype=torch.bool)
+                return spec
+
+        steps = play([1, 1, 1, 0], [LEFT] * 4, before=[Availability()], available_key="available")
+        assert column(steps, "option_done") == [0, 1, 1, 0]  # who chooses it all the same has it for one step
+        assert column(steps, "option_steps") == [1, 2, 1, 1]
+        assert column(steps, "option_terminated") == [0, 0, 0, 0]
 
     def test_reaching_the_subgoal_is_not_penalised_as_a_wrong_one(self):
         assert column(play([0, 0], wrong_subgoal_reward=-0.5), "intrinsic_reward") == [-1.0, 1.0]

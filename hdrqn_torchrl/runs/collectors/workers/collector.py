@@ -242,6 +242,8 @@ class WorkersCollector:
             self._ready = self._gather()
         if not self._has_given_up:
             self._start()
+        # First: one that is found dead now is replaced, which changes what is counted.
+        workers = [None] * len(self._starts) if self._has_given_up else self._ask_all("state_dict")
         return {
             "frames": self.frames,
             "ready": self._ready,
@@ -251,7 +253,7 @@ class WorkersCollector:
             "lost_workers": self.lost_workers,
             "lost_episodes": self.lost_episodes,
             "ages": list(self._ages),
-            "workers": [None] * len(self._starts) if self._has_given_up else self._ask_all("state_dict"),
+            "workers": workers,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -100,6 +100,19 @@ def test_a_worker_that_is_replaced_plays_other_episodes():
     assert len({first, other, again}) == 3
 
 
+def test_a_worker_that_is_lost_while_its_state_is_asked_for_leaves_no_number_to_another_episode():
+    _, collector = stamped("v3", 2)
+    before = rounds(collector, 1)[0]["collector", "traj_ids"][:, -1].unique().tolist()
+    collector.place.loses.append(1)
+    state = collector.state_dict()
+    assert collector.lost_workers == state["lost_workers"] == 1
+    _, again = stamped("v3", 2)
+    again.load_state_dict(state)
+    after = rounds(again, 1)[0]["collector", "traj_ids"]
+    assert (after[WORLDS // 2 :, 0].unsqueeze(-1) != torch.tensor(before)).all()
+    assert torch.equal(after, rounds(collector, 1)[0]["collector", "traj_ids"])
+
+
 def test_a_lost_episode_does_not_count_for_the_next_one():
     from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
 
