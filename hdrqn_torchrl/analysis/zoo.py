@@ -62,6 +62,30 @@ def disagreement(card: Card, scored: dict[str, Any]) -> list[str]:
     return found
 
 
+def check_new(name: str, zoo: Path, run: Path) -> None:
+    """Refuses a name for an agent whose folder would take the place of something else.
+
+    Args:
+        name: of the agent.
+        zoo: folder of agents.
+        run: that it is made of.
+
+    Raises:
+        ValueError: if it is not the name of one folder, or that folder is there and is no agent, or is or holds the
+            run.
+    """
+    folder = zoo / name
+    if Path(name).name != name or name == "..":
+        raise ValueError(f"name must be that of one folder, got {name!r}; for example gridworld-v3.")
+    if folder.resolve() in (run.resolve(), *run.resolve().parents):
+        raise ValueError(f"name must not be that of the run's own folder, got {name!r}; its files would be lost.")
+    if folder.exists() and (not (folder / layout.CARD).is_file() or layout.holds_training(folder)):
+        raise ValueError(
+            f"name must be a new one, or that of an agent, which is then replaced, got {name!r}: {folder} holds "
+            "something else, which would be lost; choose another name."
+        )
+
+
 def add_agent(
     run: Path,
     zoo: Path,
@@ -83,7 +107,11 @@ def add_agent(
         checkpoint: ``"best"``, ``"last"``, or the path of one.
         episodes: greedy episodes of its figures.
         allowed_targets: builders of your own that the run may name.
+
+    Raises:
+        ValueError: if the run can't be read, or by :func:`check_new`.
     """
+    check_new(name, zoo, run)
     origin, summary = read_json(run / layout.ORIGIN), read_json(run / layout.SUMMARY)  # before minutes of play
     agent = load_agent(run, checkpoint=checkpoint, num_envs=WORLDS, allowed_targets=allowed_targets)
     seed = agent.config.evaluation.seed + 1

@@ -236,6 +236,20 @@ def refuse_other_databases(config: RunSettings, known: Set[str]) -> None:
             )
 
 
+def refuse_overwriting(run: Plan) -> None:
+    """Ends the program if a run without checkpoints, which can only begin anew, has results or weights to lose."""
+    remedies = {
+        layout.SUMMARY: "Begin a new run in another folder",
+        layout.WEIGHTS: f"Begin a new run with its weights by init_from={run.folder}",
+    }
+    for name, remedy in remedies.items():
+        if (run.folder / name).exists() and not run.config.resume_override:
+            raise SettingsError(
+                f"resume must name a run that has checkpoints, got {run.folder}, which has none: it would begin anew, "
+                f"and its {name} would be void. {remedy}, or allow it with resume_override=true."
+            )
+
+
 def refuse_going_back(checkpoint: Path) -> None:
     """Ends the program if a run was saved later than ``checkpoint``: going on from there would undo that."""
     if later := sorted(path.name for path in checkpoint.parent.glob("checkpoint-*") if path.name > checkpoint.name):

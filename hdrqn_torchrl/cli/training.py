@@ -22,7 +22,7 @@ from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.command_line import print_result
 from hdrqn_torchrl.cli.failures import in_words, noting_errors
 from hdrqn_torchrl.cli.origin import record
-from hdrqn_torchrl.cli.resuming import Plan
+from hdrqn_torchrl.cli.resuming import Plan, refuse_overwriting
 from hdrqn_torchrl.devices import set_deterministic
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.envs.specs import interface_differences
@@ -95,6 +95,9 @@ def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase,
     checkpoints = Checkpoints(run.folder / layout.CHECKPOINTS)
     checkpoints.clean_up()  # first: it may bring back the newest
     start = run.checkpoint or (checkpoints.newest() if run.resumed else None)
+    if run.resumed and start is None:
+        refuse_overwriting(run)
+        tell(f"{run.folder} has no checkpoint to go on from: it begins anew")
     stale = [*run.folder.glob("*.partial*"), *([run.folder / layout.METRICS] if start is None else [])]
     for path in stale:
         remove(path)

@@ -11,7 +11,7 @@ get     copies an agent to a folder of its own (default: its name), which evalua
         run=FOLDER, init_from=FOLDER/weights.safetensors
 watch   records episodes, as watch.py does; out=terminal shows them at once
 add     makes an agent of a run: its best weights, or with checkpoint=last its last (of 16 bits, if the greedy figures
-        stay what they are), its settings, play.gif, and a card with the figures
+        stay what they are), its settings, play.gif, and a card with the figures; it replaces an agent of this name
 page    writes the table of all agents, with their pictures, into a page, between marks (default: docs/zoo.md beside
         the folder of the agents)
 
@@ -120,11 +120,13 @@ def add(settings: Settings) -> None:
     """Makes an agent of a run."""
     if settings.run is None or settings.name is None:
         raise SettingsError("run and name must be given: add NAME run=RUN_DIR.")
-    from hdrqn_torchrl.analysis.zoo import add_agent
+    from hdrqn_torchrl.analysis.zoo import add_agent, check_new
 
     zoo = Path(settings.zoo)
-    if Path(settings.name).name != settings.name:
-        raise SettingsError(f"name must be that of one folder, got {settings.name!r}; for example gridworld-v3.")
+    try:
+        check_new(settings.name, zoo, Path(settings.run))
+    except ValueError as error:
+        raise SettingsError(str(error)) from error
     check_place(zoo / layout.CARD, "zoo")
     try:
         card = add_agent(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from copy import deepcopy
 from itertools import pairwise
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase, GymWrapper, TransformedEnv
@@ -72,7 +72,7 @@ def _sets(env: EnvBase, task: Task) -> tuple[SubgoalSet, ...]:
     spec = env.observation_spec.get(keys.ATTAINED, None)
     if task.subgoals or spec is None or spec.ndim != 2 or not spec.shape[-1]:
         return task.subgoals
-    return (SubgoalSet(names=tuple(map(str, range(spec.shape[-1]))), repeatable=True),)
+    return (SubgoalSet(names=tuple(map(str, range(spec.shape[-1])))),)
 
 
 def _entries(env: EnvBase, task: Task) -> Iterator[Finding]:
@@ -162,7 +162,7 @@ def _behaviour(env: EnvBase, task: Task, steps: int, seed: int) -> list[Finding]
     if found:
         return found
     for rollout in (first, other):
-        found += [*_ends(rollout, task), *_returns(rollout, task), *check_masks(rollout)]
+        found += [*_ends(rollout, task), *_paid(rollout), *_returns(rollout, task), *check_masks(rollout)]
         for each in _sets(env, task):
             found += _attained(rollout, each)
     return [*found, *_seeds(first, again, other), *_round_trip(env)]
@@ -202,6 +202,17 @@ def _ends(rollout: Rollout, task: Task) -> Iterator[Finding]:
             yield wrong(f"an episode went on after max_steps={longest}", "evaluations fail, v3 misses its end")
             return
         length[ended] = 0
+
+
+def _paid(rollout: Rollout) -> Iterator[Finding]:
+    """Whether rewards are paid in steps that agents learn from."""
+    if keys.TRUNCATED not in rollout[0]["next"]:
+        return
+    cut = _column(rollout, keys.TRUNCATED) & ~_column(rollout, keys.TERMINATED)
+    paid = _column(rollout, keys.REWARD).abs()
+    if (paid[cut] > 0).sum() > 1 and paid[cut].sum() > paid[~cut].sum():
+        text = "most of the reward is paid in steps that are 'truncated', of which agents learn nothing"
+        yield wrong(text, "it is not learned; end episodes by 'terminated' where their task ends")
 
 
 def _returns(rollout: Rollout, task: Task) -> Iterator[Finding]:
@@ -257,12 +268,18 @@ def _seeds(first: Rollout, again: Rollout, other: Rollout) -> Iterator[Finding]:
         yield wrong("another seed must give other worlds, and does not", "all seeds of a study are one")
 
 
-def _same(first: Rollout, second: Rollout) -> bool:
-    pairs = zip(first, second, strict=True)
-    return all(bool((one[key] == two[key]).all()) for one, two in pairs for key in _COMPARED if key in one)
-
-
 _COMPARED = (keys.OBSERVATION, ("next", keys.OBSERVATION), ("next", keys.REWARD), ("next", keys.DONE))
+
+
+def _same(first: Rollout, second: Rollout, entries: Sequence[NestedKey] = _COMPARED) -> bool:
+    pairs = zip(first, second, strict=True)
+    return all(bool((one[key] == two[key]).all()) for one, two in pairs for key in entries if key in one)
+
+
+def _written(rollout: Rollout) -> list[NestedKey]:
+    """All flags that a step writes: subgoals, success, what can be chosen."""
+    after = rollout[0]["next"]
+    return [("next", key) for key, value in after.items() if isinstance(value, Tensor) and value.dtype == torch.bool]
 
 
 def _is_random(rollout: Rollout) -> bool:
@@ -292,7 +309,7 @@ def _round_trip(env: EnvBase) -> Iterator[Finding]:
             return
         with own_random_numbers(0):
             rollouts.append(_go_on(env, tensordict.clone(), _GO_ON))
-    if not _same(*rollouts):
+    if not _same(rollouts[0], rollouts[1], (*_COMPARED, *_written(rollouts[0]))):
         yield wrong(
             "state_dict() must hold the whole state with random numbers, and does not", "resumed trainings differ"
         )

@@ -43,7 +43,7 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules import AllSubgoalsPolicy
 from hdrqn_torchrl.objectives.base import SequenceLoss, masked_mean
 from hdrqn_torchrl.objectives.level_targets import Columns, LevelTargets, StepEvents, make_rules
-from hdrqn_torchrl.objectives.targets import lambda_returns, sequence_priority
+from hdrqn_torchrl.objectives.targets import check_bounds, lambda_returns, sequence_priority
 
 Values = tuple[Tensor, ...]
 
@@ -150,6 +150,7 @@ class AllSubgoalsLoss(SequenceLoss):
         for name, value in {**rates, "trace_decay": trace_decay}.items():
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
+        check_bounds(min_meta_target, max_meta_target, names=("min_meta_target", "max_meta_target"))
         if lookahead < 1:
             raise ValueError(f"lookahead must be >= 1 step, got {lookahead}; the last step is never trained.")
         super().__init__(

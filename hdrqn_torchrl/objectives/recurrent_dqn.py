@@ -17,6 +17,7 @@ from hdrqn_torchrl.modules import ObservationPredictor
 from hdrqn_torchrl.objectives.base import LossFunction, SequenceLoss, masked_mean
 from hdrqn_torchrl.objectives.sequences import Sequences, step_of, take_apart
 from hdrqn_torchrl.objectives.targets import (
+    check_bounds,
     check_returns,
     greedy_choice,
     lambda_returns,
@@ -155,6 +156,7 @@ class RecurrentDQNLoss(SequenceLoss):
         if not 0.0 <= gamma <= 1.0:
             raise ValueError(f"gamma must lie in [0, 1], got {gamma}; the paper uses 0.99.")
         check_returns(trace_decay, n_step)
+        check_bounds(min_target, max_target, names=("min_target", "max_target"))
         if unknown := {unravel_key(key) for key in state_keys} - {unravel_key(key) for key in _read_by(value_network)}:
             raise ValueError(
                 f"state_keys must be recurrent states that the network reads, got {sorted(map(str, unknown))}; a "

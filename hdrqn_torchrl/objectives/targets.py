@@ -96,6 +96,28 @@ def lambda_returns(
     return target
 
 
+def check_bounds(smallest: float | None, largest: float | None, *, names: tuple[str, str]) -> None:
+    """Refuses bounds of targets that leave nothing between them.
+
+    Args:
+        smallest, largest: the bounds; ``None``: none.
+        names: what they are called.
+
+    Raises:
+        ValueError: if the smallest is above the largest.
+
+    Examples:
+        >>> check_bounds(0.0, -1.0, names=("min_target", "max_target"))
+        Traceback (most recent call last):
+        ...
+        ValueError: max_target must be >= min_target=0.0, got -1.0; they bound the return, or leave them out.
+    """
+    if smallest is not None and largest is not None and smallest > largest:
+        raise ValueError(
+            f"{names[1]} must be >= {names[0]}={smallest}, got {largest}; they bound the return, or leave them out."
+        )
+
+
 def check_returns(trace_decay: float, n_step: int) -> None:
     """Refuses lengths of targets that do not exist or contradict each other.
 

@@ -22,8 +22,8 @@ class EpisodeTracker:
     """Sums what happens in each of N environments and reports the episodes that end.
 
     Reported per episode: ``return``, ``steps`` and, as far as environment and agent have them, ``extrinsic``,
-    ``intrinsic``, ``success`` (1 if the whole task was completed) and ``in_order`` (share of subgoals reached in the
-    proper order, where the task has one).
+    ``intrinsic``, ``success`` (1 if any step completed the whole task) and ``in_order`` (share of subgoals reached in
+    the proper order, where the task has one).
 
     Args:
         task: says whether subgoals have an order, and which entry marks success.
@@ -54,6 +54,8 @@ class EpisodeTracker:
         sums = TensorDict(step, after.batch_size, device=after.device)
         if self.sums is not None:
             sums = sums + self.sums
+            if "success" in step:
+                sums["success"].clamp_(max=1.0)  # in several steps of an episode, it may be
         self.sums = sums.clone().masked_fill_(after.get(keys.DONE).squeeze(-1), 0.0)
         return sums
 

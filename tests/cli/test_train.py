@@ -420,6 +420,18 @@ class TestWhatIsLeftAlone:
         assert told[-1].startswith("error: ") and "already holds a run, which would be overwritten" in told[-1]
         assert snapshot(a_run) == before
 
+    @pytest.mark.parametrize(
+        ("name", "remedy"), [("summary.json", "in another folder"), ("weights.safetensors", "by init_from=run,")]
+    )
+    def test_results_and_weights_without_checkpoints_are_not_overwritten(self, a_run, name, remedy):
+        shutil.rmtree(a_run / "checkpoints")
+        if name != "summary.json":
+            (a_run / "summary.json").rename(a_run / name)
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run")
+        assert "resume must name a run that has checkpoints" in told[-1] and remedy in told[-1]
+        assert snapshot(a_run) == before
+
     def test_resuming_an_older_checkpoint_is_refused_while_there_are_newer_ones(self, a_run):
         before = snapshot(a_run)
         told = self.refused(a_run.parent, "resume=run/checkpoints/checkpoint-000000000512")
@@ -494,9 +506,10 @@ class TestFailures:
 
     def test_a_run_that_was_killed_before_its_first_checkpoint_starts_again(self, a_run, finished):
         shutil.rmtree(a_run / "checkpoints")
+        (a_run / "summary.json").unlink()
         (a_run / "metrics.partial").write_text("half")
         code, _, told = run_script(a_run.parent, "resume=run")
-        assert code == 0, told
+        assert code == 0 and "run has no checkpoint to go on from: it begins anew" in told, told
         assert table(a_run) == table(finished / "run") and not (a_run / "metrics.partial").exists()
         check_same_checkpoint(a_run, finished / "run")
 

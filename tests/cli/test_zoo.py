@@ -165,12 +165,33 @@ def test_an_agent_is_played_as_a_run_is(agents, monkeypatch):
         (["add", "new"], r"run and name must be given"),
         (["add", "new", "run=nowhere"], r"run must be that of a finished training, got nowhere"),
         (["add", "new/er", "run=nowhere"], r"name must be that of one folder, got 'new/er'"),
+        (["add", "..", "run=nowhere"], r"name must be that of one folder, got '\.\.'"),
     ],
 )
 def test_mistakes_are_told_and_leave_the_folder_as_it_was(agents, arguments, message):
     with pytest.raises(SystemExit, match=message):
         call(*arguments, f"zoo={agents}")
     assert [path.name for path in agents.iterdir()] == ["small-v2"]
+
+
+@pytest.mark.parametrize(
+    ("name", "zoo_folder", "message"),
+    [
+        ("run", "runs", "name must not be that of the run's own folder, got 'run'"),
+        ("runs", ".", "name must not be that of the run's own folder, got 'runs'"),
+        ("other", "runs", "name must be a new one, or that of an agent, which is then replaced, got 'other'"),
+        ("texts", ".", "name must be a new one, or that of an agent, which is then replaced, got 'texts'"),
+    ],
+)
+def test_an_agent_takes_the_place_of_nothing_but_an_agent(agents, tmp_path, monkeypatch, name, zoo_folder, message):
+    for run in ("run", "other"):
+        shutil.copytree(agents.parent / "run", tmp_path / "runs" / run)
+    (tmp_path / "texts").mkdir()
+    monkeypatch.setattr("hdrqn_torchrl.analysis.zoo.score", played := Mock())
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(SystemExit, match=re.escape(message)):
+        call("add", name, f"run={tmp_path / 'runs' / 'run'}", f"zoo={tmp_path / zoo_folder}")
+    assert sorted(tmp_path.rglob("*")) == before and not played.called
 
 
 def test_a_folder_without_agents_is_refused(tmp_path):

@@ -73,6 +73,14 @@ class Forgetful(Corridor):
         self._steps = state_dict["steps"]
 
 
+class PaidLate(Corridor):
+    """Pays for nothing but the end of an episode, which it calls truncated."""
+
+    def _step(self, tensordict):
+        after = super()._step(tensordict)
+        return after.update({key: after["truncated"].float() for key in ("reward", "extrinsic_reward")})
+
+
 class Stateless(Corridor):
     def state_dict(self, *args, **kwargs):
         return {}
@@ -142,6 +150,8 @@ class Late(Corridor):
             corridor(masked=True, odd={"action_mask": Binary(shape=(4, 3))}),
             r"'action_mask' must be torch.bool \[4, 2\]",
         ),
+        (corridor(PaidLate), "most of the reward is paid in steps that are 'truncated'"),
+        (corridor(Standing, task=Task()), "'attained' must be true once in an episode"),
         (corridor(Standing), "'attained' must be true only in the step that attains a subgoal"),
         (corridor(task=Task(subgoals=(SubgoalSet(names=("a", "b")),))), "'attained' must be true once in an episode"),
         (corridor(task=Task(subgoals=(SubgoalSet(names=("a",)),))), r"'attained' must be torch.bool \[4, 1\]"),

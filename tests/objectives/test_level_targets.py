@@ -268,6 +268,11 @@ def test_each_set_has_its_own_penalty():
         make_loss(4, wrong_subgoal_reward=[0.0])
 
 
+def test_bounds_that_leave_nothing_between_them_are_refused():
+    with pytest.raises(ValueError, match=r"max_meta_target must be >= min_meta_target=0.0, got -1.0"):
+        make_loss(2, min_meta_target=0.0, max_meta_target=-1.0)
+
+
 def three_levels(actions, **events):
     """One sequence of one episode; one near and one far subgoal, two actions; nothing happens but the events."""
     near, far = OptionKeys("near"), OptionKeys()

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from helpers import build, collect, small_env
+from tensordict import TensorDict
 
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.runs.episode_tracker import EpisodeTracker
@@ -35,6 +36,16 @@ def test_sums_over_many_batches_equal_a_plain_loop():
             assert {key: row[key].item() for key in TRACKED} == pytest.approx(sums)
         expected += ended
     assert len(expected) > 20 and any(sums["success"] for sums in expected)
+
+
+def test_an_episode_with_several_steps_of_success_is_one_success():
+    """As where the goal, once reached, stays reached until the time limit."""
+    tracker, flags = EpisodeTracker(), torch.tensor([[0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 1, 0]]).bool()
+    done = torch.tensor([[0, 0, 0, 1, 0, 1]] * 2).bool()
+    after = TensorDict(success=flags.unsqueeze(-1), done=done.unsqueeze(-1), batch_size=[2, 6])
+    after["reward"] = torch.ones(2, 6, 1)
+    found = [tracker.finished(TensorDict(next=part, batch_size=part.shape)) for part in after.split(3, 1)]
+    assert [each["success"].tolist() for each in found] == [[], [1.0, 0.0, 0.0, 1.0]]
 
 
 def test_flat_agents_have_no_intrinsic_reward():

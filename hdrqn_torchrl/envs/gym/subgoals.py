@@ -27,7 +27,8 @@ class Subgoals:
         prefix: of their entries; empty for the farthest set, the only one that agents of two levels pursue.
         repeatable: whether a subgoal can be attained more than once in an episode; one answer for each, or for all.
 
-    Every world has a copy of its own, so that a set may keep something from step to step.
+    Every world has a copy of its own, so that a set may keep something from step to step. If the environment has
+    ``state_dict`` and ``load_state_dict``, such a set needs them, too, for resumed trainings.
 
     Examples:
         A key to pick up, then a door to open, in MiniGrid's DoorKey:
@@ -108,13 +109,17 @@ class SubgoalRecord:
         self._held, self._attained = holds, self._attained | attained
         return self._entries(attained)
 
-    def state_dict(self) -> dict[str, list[bool]]:
-        """What holds and what was attained, as plain data."""
-        return {"held": self._held.tolist(), "attained": self._attained.tolist()}
+    def state_dict(self) -> dict[str, Any]:
+        """What holds and what was attained, as plain data; and what the set itself keeps, if it says so."""
+        own = getattr(self.subgoals, "state_dict", None)
+        kept = {} if own is None else {"own": own()}
+        return {"held": self._held.tolist(), "attained": self._attained.tolist(), **kept}
 
-    def load_state_dict(self, state: Mapping[str, Sequence[bool]]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._held, self._attained = (np.asarray(state[name], np.bool_) for name in ("held", "attained"))
+        if "own" in state:
+            self.subgoals.load_state_dict(state["own"])  # type: ignore[attr-defined]
 
     def _conditions(self, before: Any, after: Any, info: Mapping[str, Any]) -> Flags:
         self._steps = 0 if before is None else self._steps + 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -87,13 +88,14 @@ class World:
         self._records = [SubgoalRecord(each, env) for each in reading.subgoals]
         self.shown: Any = None
         """The last observation, as the environment returned it."""
+        self._before: Any = None  # the same, for subgoals: an environment may write the next one into its place
 
     def begin(self, observation: Any, info: Mapping[str, Any]) -> Entries:
         """Entries at the start of an episode."""
-        self.shown = observation
         entries = self._entries(observation, info_of(info, "reset"), over=False)
         for record in self._records:
             entries |= record.begin(observation, info)
+        self._keep(observation)
         no = np.zeros(1, np.bool_)
         return entries | {key: no for key in (keys.SUCCESS, keys.HAZARD) if key in self.reading.space.spaces}
 
@@ -104,8 +106,8 @@ class World:
         told = {"reward": reward, "terminated": terminated, "truncated": truncated, **info}
         entries = self._entries(observation, info, over=terminated or truncated)
         for record in self._records:
-            entries |= record.step(self.shown, observation, told)
-        self.shown = observation
+            entries |= record.step(self._before, observation, told)
+        self._keep(observation)
         for key, rule in ((keys.SUCCESS, self.reading.success), (keys.HAZARD, self.reading.hazard)):
             if rule is not None:
                 entries[key] = np.array([truth_of(_applied(rule, reward, told, key), key)])
@@ -113,16 +115,21 @@ class World:
             reward = number_of(_applied(rule, reward, told, "reward"), "reward")
         return entries, reward, terminated, truncated
 
-    def subgoals_state(self) -> list[dict[str, list[bool]]]:
+    def subgoals_state(self) -> list[dict[str, Any]]:
         """What was attained so far, as plain data."""
         return [record.state_dict() for record in self._records]
 
-    def go_on(self, shown: Any, subgoals: Sequence[Mapping[str, list[bool]]]) -> Entries:
+    def go_on(self, shown: Any, subgoals: Sequence[Mapping[str, Any]]) -> Entries:
         """Goes on in the middle of an episode that was left with this observation and :meth:`subgoals_state`."""
-        self.shown = shown
+        self._keep(shown)
         for record, state in zip(self._records, subgoals, strict=True):
             record.load_state_dict(state)
         return {keys.OBSERVATION: self.reading.encoder.encode(shown)}
+
+    def _keep(self, observation: Any) -> None:
+        self.shown = observation
+        if self._records:
+            self._before = deepcopy(observation)
 
     def _entries(self, observation: Any, info: Mapping[str, Any], *, over: bool) -> Entries:
         entries: Entries = {keys.OBSERVATION: self.reading.encoder.encode(observation)}

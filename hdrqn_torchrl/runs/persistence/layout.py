@@ -41,6 +41,11 @@ def holds_run(folder: Path) -> bool:
     return (folder / CONFIG).exists() or (folder / CHECKPOINTS).exists()
 
 
+def holds_training(folder: Path) -> bool:
+    """Whether there are measurements or checkpoints in a folder, as in a run's and not in an agent's of a zoo."""
+    return (folder / METRICS).exists() or (folder / CHECKPOINTS).exists()
+
+
 def is_checkpoint(path: Path) -> bool:
     """Whether a path names a checkpoint of a run rather than a run."""
     return path.parent.name == CHECKPOINTS

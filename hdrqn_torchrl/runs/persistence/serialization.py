@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict, TensorDictBase
@@ -25,7 +26,7 @@ class SafetensorsAdapter(CheckpointAdapter):
     """Writes a component's ``state_dict`` as one safetensors file and one JSON file.
 
     TorchRL's own adapter falls back to ``torch.load`` when it meets a pickle; this one has nothing to fall back to.
-    A state may nest dicts, lists, tuples, tensors, TensorDicts, numbers, strings and ``None``.
+    A state may nest dicts, lists, tuples, tensors, TensorDicts, arrays of numbers, numbers, strings and ``None``.
 
     Args:
         rules: what entries of TensorDicts must be, checked before they are loaded
@@ -99,6 +100,10 @@ def _encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
         assert name not in tensors, name
         tensors[name] = value.detach()
         return {"tensor": name}
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return {"array": inner("array", torch.from_numpy(value.copy()))["tensor"]}
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, TensorDictBase):
         items = {key: inner(key, item) for key, item in value.items()}
         return {"tensordict": items, "batch_size": list(value.batch_size), "names": list(value.names)}
@@ -111,7 +116,10 @@ def _encode(value: Any, tensors: dict[str, Tensor], name: str) -> Any:
         return {"device": str(value)}
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
-    raise TypeError(f"a state may hold tensors, numbers, strings and containers of them, got {type(value)} at {name}.")
+    raise TypeError(
+        f"a state may hold tensors, arrays of numbers, numbers, strings and containers of them, got {type(value)} at "
+        f"{name}."
+    )
 
 
 def _decode(value: Any, tensors: Mapping[str, Tensor], device: torch.device) -> Any:
@@ -122,6 +130,8 @@ def _decode(value: Any, tensors: Mapping[str, Tensor], device: torch.device) -> 
     content = value[kind]
     if kind == "tensor":
         return tensors[content].to(device, copy=True)  # a copy, as the original is mapped from the file
+    if kind == "array":
+        return tensors[content].numpy().copy()
     if kind == "tensordict":
         items = {key: _decode(item, tensors, device) for key, item in content.items()}
         names = value["names"] if any(value["names"]) else None

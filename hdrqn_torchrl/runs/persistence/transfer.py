@@ -85,8 +85,7 @@ def start_from(algorithm: Algorithm, weights: Weights) -> None:
     Raises:
         ValueError: if they have others, naming the first of them; nothing is copied then.
     """
-    found_itself = {name: each for name, each in algorithm.policy.named_buffers() if name.startswith("critic.")}
-    wanted = {**dict(algorithm.policy.named_parameters()), **found_itself}
+    wanted = {name: each for name, each in algorithm.policy.state_dict().items() if not _is_of_exploration(name)}
     found = {name: value for name, value in weights.items() if name in wanted or not _is_of_exploration(name)}
     differing = [
         f"{name} is {_shape(found.get(name))} there and {_shape(wanted.get(name))} here"

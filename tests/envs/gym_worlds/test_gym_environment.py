@@ -7,7 +7,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit, TransformObservation
 from torchrl.envs.utils import check_env_specs
 
-from hdrqn_torchrl.envs import Reference, Symmetry, Task, check_task, make_gym
+from hdrqn_torchrl.envs import Reference, Subgoals, Symmetry, Task, check_task, make_gym
 from hdrqn_torchrl.envs.gym import worlds
 
 STEPS = 40
@@ -118,7 +118,55 @@ class TestRules:
             assert torch.equal(each["action_mask"][..., 1:], each["observation"][..., :1] % 2 == 0)
 
 
+def test_subgoals_see_both_observations_of_an_environment_that_writes_into_one_array():
+    class InPlace(Counter):
+        shown = np.zeros(2, np.float32)
+
+        def _shown(self):
+            self.shown[:] = super()._shown()
+            return self.shown
+
+    class Steps(Subgoals):
+        names = ("one", "two")
+        repeatable = True
+
+        def conditions(self, env, before, after, info):
+            return [before is not None and after[0] - before[0] == size for size in (1, 2)]
+
+    found = [played(make_gym(factory, 1, subgoals=Steps(), seed=0)) for factory in (Counter, InPlace)]
+    assert found[0]["next", "attained"].any() and torch.equal(*(each["next", "attained"] for each in found))
+
+
 class TestState:
+    def test_what_subgoals_keep_is_part_of_the_state_if_they_say_so(self):
+        class Offering(Counter):
+            state_dict, load_state_dict = Remembering.state_dict, Remembering.load_state_dict
+
+        class Third(Subgoals):
+            """Attained in every third step of all."""
+
+            names = ("third",)
+            repeatable = True
+            steps = 0
+
+            def conditions(self, env, before, after, info):
+                self.steps += before is not None
+                return (before is not None and self.steps % 3 == 0,)
+
+        class Stored(Third):
+            def state_dict(self):
+                return {"steps": self.steps}
+
+            def load_state_dict(self, state):
+                self.steps = state["steps"]
+
+        what = [
+            [each.what for each in check_task(make_gym(Offering, 2, subgoals=subgoals, seed=0))]
+            for subgoals in (Stored(), Third())
+        ]
+        hole = "state_dict() must hold the whole state with random numbers, and does not"
+        assert [hole in each for each in what] == [False, True]
+
     @pytest.mark.parametrize("factory", [Counter, lambda: TimeLimit(Counter(), 6), Remembering])
     def test_episodes_in_progress_go_on_as_if_nothing_had_happened(self, factory):
         def make(seed):

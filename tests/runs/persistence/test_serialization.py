@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 from helpers import State
@@ -65,6 +66,20 @@ class TestWhatAStateMayHold:
             wanted.view(torch.uint8) if found.ndim else wanted
         )
 
+    @pytest.mark.parametrize(
+        "array",
+        [np.arange(6, dtype=np.int16).reshape(2, 3).T, np.array(2.5), np.zeros((0, 2)), np.array([True, False])],
+        ids=lambda array: f"{array.dtype}-{array.shape}",
+    )
+    def test_arrays_come_back_as_arrays(self, tmp_path, array):
+        found = round_trip({"a": [array]}, tmp_path)["a"][0]
+        assert isinstance(found, np.ndarray) and found.dtype == array.dtype and np.array_equal(found, array)
+        assert found.shape == array.shape and found.flags.writeable
+
+    def test_numbers_of_numpy_come_back_as_numbers(self, tmp_path):
+        found = round_trip([np.int64(3), np.bool_(True), np.float32(0.5)], tmp_path)
+        assert found == [3, True, 0.5] and [type(each) for each in found] == [int, bool, float]
+
     def test_tensors_that_share_memory_come_back_separately(self, tmp_path):
         whole = torch.arange(6.0)
         found = round_trip([whole, whole, whole[2:4], whole.view(2, 3)], tmp_path)
@@ -106,6 +121,6 @@ class TestWhatAStateMayHold:
     )
     def test_other_objects_are_refused_by_their_path(self, tmp_path, value):
         checkpoints = Checkpoints(tmp_path)
-        with pytest.raises(TypeError, match=r"a state may hold tensors, numbers, .*at inner/0\."):
+        with pytest.raises(TypeError, match=r"a state may hold tensors, arrays of numbers, .*at inner/0\."):
             checkpoints.save({"part": State({"inner": [value]})}, step=1)
         assert not list(tmp_path.iterdir())

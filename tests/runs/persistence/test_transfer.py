@@ -41,6 +41,20 @@ def test_networks_and_target_networks_are_copied_and_all_else_is_new(name):
     assert all(exploration.frames == 0 and exploration.epsilon == 1.0 for exploration in target.explorations.values())
 
 
+def test_buffers_of_a_network_are_copied_too():
+    """For example the statistics of a normaliser."""
+
+    def with_statistics():
+        algorithm = build("drqn", small_env(2))
+        algorithm.policy.get_submodule("network").register_buffer("mean", torch.zeros(3))
+        return algorithm
+
+    source, target = with_statistics(), with_statistics()
+    source.policy.get_submodule("network").mean += 2.0
+    start_from(target, source.policy.state_dict())
+    assert (target.policy.get_submodule("network").mean == 2.0).all()
+
+
 def _live_name(loss):
     (name,) = (key for key in vars(loss)["_modules"] if key.startswith("target_"))
     return name.removeprefix("target_")
