@@ -156,8 +156,10 @@ class Trainer:
         try:
             yield from self._complete_iteration()
             if self.frames < self.total_frames:
-                for batch in self._collected():
+                for index, batch in enumerate(self._collected()):
                     yield
+                    if index == 0:
+                        self._saving.check_storable("collector")  # it has states of a user's environment
                     self._receive(batch)
                     yield from self._complete_iteration()
                     if self.frames >= self.total_frames:

@@ -13,6 +13,7 @@ from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.persistence.components import explained
+from hdrqn_torchrl.runs.persistence.serialization import check_storable
 from hdrqn_torchrl.runs.persistence.state_checks import Rule
 
 
@@ -55,6 +56,24 @@ class Saving:
         if self.checkpoints is not None and self._place() != self._saved:
             self.checkpoints.save(self._parts(), step=frames, score=score)
             self._take_note()
+
+    def check_storable(self, name: str) -> None:
+        """Tries whether a part can be stored: at the first checkpoint a failure would cost all that came before.
+
+        Args:
+            name: of the part.
+
+        Raises:
+            CheckpointError: if it holds what no checkpoint can.
+        """
+        if self.checkpoints is None:
+            return
+        try:
+            check_storable(self._parts()[name].state_dict(), name)
+        except TypeError as error:
+            raise CheckpointError(
+                f"{error} Where that is the environment's, change what its state_dict returns; nothing was trained yet."
+            ) from error
 
     def save_after(self, error: Exception, frames: int, *, given_up: bool = False) -> None:
         """Writes one though something has failed; the error takes note if it can't be written, either.

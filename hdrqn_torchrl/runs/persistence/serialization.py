@@ -65,6 +65,25 @@ class SafetensorsAdapter(CheckpointAdapter):
         component.load_state_dict(state)
 
 
+def check_storable(state: Any, name: str) -> None:
+    """Refuses a state that no checkpoint can hold.
+
+    Args:
+        state: of any component.
+        name: of the component, for the message.
+
+    Raises:
+        TypeError: naming what it holds, and where.
+
+    Examples:
+        >>> check_storable({"places": [{1, 2}]}, "collector")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        TypeError: a state may hold tensors, ... got <class 'set'> at collector/places/0.
+    """
+    _encode(state, {}, name)
+
+
 def check_tensors(path: Path, *, root: Path | None = None) -> None:
     """Refuses a safetensors file that promises more than it holds, before it is mapped.
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from helpers import check_same, make_training, seed_everything, table
+from helpers import check_same, make_training, seed_everything, small_env, table
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.learning.finite import NonFiniteError
@@ -138,6 +138,19 @@ def test_a_training_whose_evaluation_fails_goes_on_bit_for_bit(tmp_path):
         trainer.train()
     go_on(tmp_path / "failed")
     check_same(tmp_path / "failed", tmp_path / "plain")
+
+
+def test_a_state_that_can_not_be_stored_is_told_with_the_first_batch(tmp_path):
+    def with_a_set(*args, **settings):
+        env = small_env(*args, **settings)
+        state = env.state_dict
+        env.state_dict = lambda *args, **kwargs: {**state(*args, **kwargs), "visited": {1, 2}}
+        return env
+
+    trainer = make_training(tmp_path, worlds=with_a_set)
+    with pytest.raises(CheckpointError, match=r"got <class 'set'> at collector/.*/visited\. Where that is the env"):
+        trainer.train()
+    assert trainer.frames == 0
 
 
 def test_an_error_is_told_even_if_the_training_can_not_be_saved(tmp_path):
