@@ -61,7 +61,8 @@ def label_of(evaluation: Evaluation) -> str:
     """What the agent is called, and whether it was told of subgoals by a bonus."""
     name = AGENTS[evaluation.agent]
     is_hierarchical = evaluation.agent.endswith("_levels")  # and takes no bonus
-    return name if is_hierarchical else f"{name}, {'bonus' if evaluation.bonus else 'no bonus'}"
+    bonus = {0.0: "no bonus", 1.0: "bonus"}.get(evaluation.bonus, f"bonus {evaluation.bonus:g}")
+    return name if is_hierarchical else f"{name}, {bonus}"
 
 
 def values_at(runs: Sequence[Run], axis: str, figure: str, places: NDArray[np.float64]) -> NDArray[np.float64]:

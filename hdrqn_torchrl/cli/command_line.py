@@ -14,17 +14,21 @@ from omegaconf import MISSING, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
+from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 from hdrqn_torchrl.runs.settings.commands import as_called
 
 
 def check_place(path: Path, key: str) -> None:
-    """Refuses a file that can't be written, before anything is done; makes its folder.
+    """Refuses a file that can't be written, or is one of a run's own, before anything is done; makes its folder.
 
     Args:
         path: the file.
         key: the setting that names it.
     """
+    real = path.resolve()
+    if real.name in (*layout.WRITTEN, layout.WEIGHTS, layout.CARD) and layout.holds_run(real.parent):
+        raise SettingsError(f"{key} must not be a file that a run consists of, got {str(path)!r}; name another one.")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         probe = path.with_name(f".{path.name}.partial")

@@ -5,6 +5,17 @@ from __future__ import annotations
 import re
 
 
+def part_of(text: str, mark: str) -> str:
+    """What stands between a pair of marks; nothing if they are not there.
+
+    Examples:
+        >>> part_of("before <!-- a -->\\nold\\n<!-- end of a --> after", "a")
+        'old'
+    """
+    begin, end = f"<!-- {mark} -->\n", f"\n<!-- end of {mark} -->"
+    return text.partition(begin)[2].partition(end)[0] if begin in text and end in text else ""
+
+
 def put(text: str, mark: str, part: str) -> str:
     """Replaces the text between a pair of marks, or adds text and marks at the end.
 

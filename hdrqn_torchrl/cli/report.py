@@ -36,7 +36,7 @@ from hdrqn_torchrl.analysis.grouping import value_of
 from hdrqn_torchrl.analysis.results import AXES, final_value
 from hdrqn_torchrl.cli.command_line import as_list, command_line
 from hdrqn_torchrl.cli.entries import common_references, note, shortened
-from hdrqn_torchrl.cli.marks import put
+from hdrqn_torchrl.cli.marks import part_of, put
 from hdrqn_torchrl.cli.studies import STUDIES, Drawing, Study
 from hdrqn_torchrl.cli.study_runs import Found, Matched, Runs, check_archive, keep_runs, read_runs, runs_of_jobs
 from hdrqn_torchrl.runs.persistence import layout
@@ -83,6 +83,7 @@ def run(settings: Settings) -> None:
     out = Path(settings.out)
     out.with_suffix("").mkdir(parents=True, exist_ok=True)
     text = out.read_text() if out.exists() else "# Results\n"
+    left: list[str] = []
     overview = [CLAIMS.replace("|", "| study |", 1).replace("|---", "|---|---", 1)]
     with ExitStack() as stack:
         runs = read_runs(patterns, stack)
@@ -90,12 +91,19 @@ def run(settings: Settings) -> None:
         for study in STUDIES:
             if study.name in wanted and settings.size in study.sizes:
                 matched = runs_of_jobs(study.name, settings.size, runs)
+                mark = f"{study.name} {settings.size}"
+                if not matched.runs and "\n|" in part_of(text, mark):
+                    note(f"note: {study.name}: none of its runs is there, so its part of {out} stays as it is")
+                    left.append(study.name)
+                    continue
                 part, claims = section(study, matched, everywhere, settings)
-                text = put(text, f"{study.name} {settings.size}", part)
+                text = put(text, mark, part)
                 overview += [f"| {study.title} {line}" for line in claims]
                 print(f"{study.name}: runs {len(matched.runs)}, missing {matched.missing}")
                 tell_of_others(study, matched)
-        if not settings.studies:
+        if left:
+            note(f"note: the table of all claims in {out} stays as it is, too")
+        elif not settings.studies:
             text = put(text, f"claims {settings.size}", "\n".join(overview))
         if settings.keep:
             keep_runs(runs, Path(settings.keep))

@@ -16,6 +16,7 @@ import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from hdrqn_torchrl.cli.configuration import plain
@@ -63,11 +64,7 @@ def plan(config: RunSettings, folder: Path) -> Plan:
     refuse_other_algorithm(choices)
     if config.resume is None:
         refuse_reference(folder)
-        if layout.holds_run(folder):
-            raise SettingsError(
-                f"{folder} already holds a run, which would be overwritten; "
-                f"`{command(folder, config.allowed_targets)}` goes on, any other hydra.run.dir begins a new one."
-            )
+        refuse_occupied(folder, config)
         return Plan(folder, config, choices, resumed=False)
     if config.resume == "auto":
         run, checkpoint = find_same(config, folder), None
@@ -156,14 +153,23 @@ def _is_read_as_it_stands(value: str) -> bool:
 
 
 def find_same(config: RunSettings, folder: Path) -> Path | None:
-    """The run that the same command started before: in ``folder``, or else the newest below ``output_root``."""
+    """The run that the same command started before: in ``folder``, or else below ``output_root``.
+
+    There one that has checkpoints is preferred, then one of as many frames, then the newest.
+    """
     if (folder / layout.CONFIG).exists():
         return folder
     if any(override.startswith(("hydra.run", "hydra.sweep")) for override in HydraConfig.get().overrides.hydra):
         return None
     runs = [path.parent for path in Path(config.output_root).glob("*/*/config.yaml")]
-    same = [run for run in runs if not _differences_or_broken(run, config)]
-    return max(same, key=lambda run: (run / layout.CONFIG).stat().st_mtime, default=None)
+    siblings = folder.resolve().parent if HydraConfig.get().mode == RunMode.MULTIRUN else None  # other jobs' runs
+    same = [run for run in runs if run.resolve().parent != siblings and not _differences_or_broken(run, config)]
+
+    def fits(run: Path) -> tuple[bool, bool, float]:
+        exact = read_config(run).total_frames == config.total_frames
+        return (run / layout.CHECKPOINTS).is_dir(), exact, (run / layout.CONFIG).stat().st_mtime
+
+    return max(same, key=fits, default=None)
 
 
 def _differences_or_broken(run: Path, config: RunSettings) -> list[str]:
@@ -193,7 +199,8 @@ def with_overrides(
             raise SettingsError(f"{override} can't be given with resume=FOLDER: settings come from that run.")
         OmegaConf.update(config, key, OmegaConf.select(composed, key), merge=False, force_add=True)
     if config.total_frames > stored.total_frames:
-        for path in _following(as_plain(stored)):
+        given_too = {override.lstrip("+~").partition("=")[0] for override in overrides}
+        for path in set(_following(as_plain(stored))) - given_too:
             OmegaConf.update(config, path, config.total_frames)
     return replace(
         settings_of(plain(config)),
@@ -236,18 +243,41 @@ def refuse_other_databases(config: RunSettings, known: Set[str]) -> None:
             )
 
 
+def refuse_occupied(folder: Path, config: RunSettings) -> None:
+    """Ends the program if there is a run in the folder of a new one, or something else that has its files' names."""
+    if layout.holds_run(folder):
+        raise SettingsError(
+            f"{folder} already holds a run, which would be overwritten; "
+            f"`{command(folder, config.allowed_targets)}` goes on, any other hydra.run.dir begins a new one."
+        )
+    if found := [name for name in layout.WRITTEN if name != layout.ERROR and (folder / name).exists()]:
+        raise SettingsError(
+            f"{folder} holds no run, but {', '.join(found)}, which would be overwritten; name another hydra.run.dir."
+        )
+
+
 def refuse_overwriting(run: Plan) -> None:
     """Ends the program if a run without checkpoints, which can only begin anew, has results or weights to lose."""
     remedies = {
         layout.SUMMARY: "Begin a new run in another folder",
         layout.WEIGHTS: f"Begin a new run with its weights by init_from={run.folder}",
+        layout.METRICS: "Begin a new run in another folder",
     }
     for name, remedy in remedies.items():
-        if (run.folder / name).exists() and not run.config.resume_override:
+        lost = (run.folder / name).exists() and (name != layout.METRICS or _had_checkpoints(run))
+        if lost and not run.config.resume_override:
             raise SettingsError(
                 f"resume must name a run that has checkpoints, got {run.folder}, which has none: it would begin anew, "
                 f"and its {name} would be void. {remedy}, or allow it with resume_override=true."
             )
+
+
+def _had_checkpoints(run: Plan) -> bool:
+    """Whether a run has measured more than there is before its first checkpoint."""
+    from hdrqn_torchrl.analysis.results import read_metrics
+
+    frames = read_metrics(run.folder / layout.METRICS).get("frames", [0])
+    return max(frames, default=0) > run.config.checkpoint.interval_frames + run.config.log_frames
 
 
 def refuse_going_back(checkpoint: Path) -> None:

@@ -22,7 +22,7 @@ from hdrqn_torchrl.cli import sweeps
 from hdrqn_torchrl.cli.command_line import print_result
 from hdrqn_torchrl.cli.failures import in_words, noting_errors
 from hdrqn_torchrl.cli.origin import record
-from hdrqn_torchrl.cli.resuming import Plan, refuse_overwriting
+from hdrqn_torchrl.cli.resuming import Plan, refuse_occupied, refuse_overwriting
 from hdrqn_torchrl.devices import set_deterministic
 from hdrqn_torchrl.envs import task_of
 from hdrqn_torchrl.envs.specs import interface_differences
@@ -92,14 +92,17 @@ def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase,
     """Builds what a run needs (:func:`build_run`), where it begins or where it goes on; clears what is out of date."""
     for name in layout.WRITTEN:
         check_file(run.folder / name)
+    if not run.resumed:
+        refuse_occupied(run.folder, run.config)  # again: another process may have begun one since this was planned
     checkpoints = Checkpoints(run.folder / layout.CHECKPOINTS)
     checkpoints.clean_up()  # first: it may bring back the newest
     start = run.checkpoint or (checkpoints.newest() if run.resumed else None)
     if run.resumed and start is None:
         refuse_overwriting(run)
         tell(f"{run.folder} has no checkpoint to go on from: it begins anew")
-    stale = [*run.folder.glob("*.partial*"), *([run.folder / layout.METRICS] if start is None else [])]
-    for path in stale:
+    own = {Path(name).stem for name in layout.WRITTEN}
+    stale = [path for path in run.folder.glob("*.partial*") if path.name.partition(".")[0] in own]
+    for path in [*stale, *([run.folder / layout.METRICS] if start is None else [])]:
         remove(path)
     trainer, evaluation_env, players = build_run(run, stop)
     facts = facts_of(trainer.collector.env.base_env)
@@ -114,7 +117,7 @@ def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase,
         run = replace(run, weights=path)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
     write_facts(run.folder, facts)
-    for name in layout.AT_THE_END:
+    for name in layout.AT_THE_END if trainer.frames < run.config.total_frames else (layout.ERROR,):
         remove(run.folder / name)
     return trainer, evaluation_env, players
 

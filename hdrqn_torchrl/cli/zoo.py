@@ -127,7 +127,7 @@ def add(settings: Settings) -> None:
         check_new(settings.name, zoo, Path(settings.run))
     except ValueError as error:
         raise SettingsError(str(error)) from error
-    check_place(zoo / layout.CARD, "zoo")
+    check_place(zoo / "agents", "zoo")
     try:
         card = add_agent(
             Path(settings.run),

@@ -41,10 +41,10 @@ def relabel_subgoals(
     Relabelled for a subgoal g other than the one pursued at its first step, a sequence differs as acting would have:
 
     - g is in force throughout, and reward and termination of each step are those of g;
-    - the option ends where g is reached, or can't be chosen any more. Reaching the subgoal really pursued, or losing
-      it, does not end an option for g, so there the recurrent state goes on; to cut the sequence there would leave out
-      steps *because* of what they attained, which biases values. Every other end (episode, time limit) ends one for
-      g, too;
+    - the option ends where g is reached, or lost: it can't be chosen any more, and is worth nothing. Reaching the
+      subgoal really pursued, or losing it, does not end an option for g, so there the recurrent state goes on; to cut
+      the sequence there would leave out steps *because* of what they attained, which biases values. Every other end
+      (episode, time limit) ends one for g, too;
     - where g could not be chosen, since it had been attained before or was not available, a step is not eligible for
       the loss. The next eligible one starts an option, so these steps reach no target and no state that is trained.
 
@@ -81,11 +81,11 @@ def relabel_subgoals(
     pursued, attained, left = told.get(subgoal_key).unsqueeze(-1), after.get(attained_key), told.get(mask_key)
     subgoal = torch.where(shift > 0, (pursued[:, :1] + shift) % num_subgoals, pursued)  # [G * B, T, 1]
 
-    reached = attained.gather(-1, subgoal)
-    terminated = reached | after.get(keys.TERMINATED)
     stays = left & torch.cat([left[:, 1:], torch.ones_like(left[:, :1])], 1)
+    reached, eligible = attained.gather(-1, subgoal), left.gather(-1, subgoal)
+    lost = eligible & ~stays.gather(-1, subgoal) & ~reached & ~after.get(keys.DONE)
+    terminated = reached | lost | after.get(keys.TERMINATED)
     cut = after.get(option_done_key) & ~attained.gather(-1, pursued) & stays.gather(-1, pursued)
-    eligible = left.gather(-1, subgoal)
     done = terminated | cut | ~stays.gather(-1, subgoal) | after.get(keys.DONE)
     init = torch.cat([told.get(option_init_key)[:, :1], done[:, :-1]], 1)
     reward = rewards.of(attained, reached, None if hazard_key is None else after.get(hazard_key))

@@ -84,7 +84,8 @@ class EventSelection:
         for index, reason in self._wanted(found, history):
             if reason != DEED or events[index] not in self._dropped:
                 self._keep(events[index], reason)
-        return Chosen(slots=dict(self.slots), once=slots_attained_once(self.slots, found))
+        own = Occurrences(history, list(self.slots))  # an event with a slot may since have become part of another one
+        return Chosen(slots=dict(self.slots), once=slots_attained_once(self.slots, own))
 
     def _wanted(self, found: Occurrences, history: History) -> list[tuple[int, int]]:
         """Events that could be subgoals, and why, the most important first."""

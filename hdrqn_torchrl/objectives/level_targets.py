@@ -174,15 +174,15 @@ class LevelTargets:
     ) -> Columns:
         """Adds what depends only on the pursued subgoal: reward, end, and which subgoals learn; ``[B, T, C, X]``.
 
-        A step after which c can't be pursued any more, though it was not attained, has no target: nothing is trained
-        for c there.
+        To lose c, which can't be pursued any more then, ends its pursuit as attaining it does, but pays nothing. Steps
+        that lose it must count: without them an action would be worth what it brings where it goes well.
         """
         steps = tensordict[:, :-1]
         reward, ended, unseen = events.reward, events.terminated.unsqueeze(-1), events.unseen.unsqueeze(-1)
         if rule.pursues is not None and rule.rewards is not None:
             attained = steps["next", rule.pursues.attained]  # [B, T, C]
-            reward, ended = rule.rewards.of_all(attained, events.hazard), ended | attained
-            unseen = unseen | ~tensordict[rule.pursues.subgoal_mask][:, 1:]
+            lost = ~tensordict[rule.pursues.subgoal_mask][:, 1:] & ~unseen
+            reward, ended = rule.rewards.of_all(attained, events.hazard), ended | attained | lost
             trained = trained & steps[rule.pursues.subgoal_mask].unsqueeze(-1)
             if not self.all_subgoals:
                 trained = trained & _pursued(rule.pursues, steps).unsqueeze(-1)

@@ -84,7 +84,7 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int, max_s
     own, *above = algorithm.levels
     score = Score((False,) * len(_attained(tensordict[0])), intrinsic=None if own.reward_key is None else 0.0)
     pursuits: tuple[Pursuit, ...] = ()
-    event = ""
+    event, attained = "", score.reached
     for step in range(longest):
         algorithm.policy(tensordict)
         now = tensordict[0]
@@ -106,14 +106,16 @@ def _play(env: EnvBase, algorithm: Algorithm, episode: int, episodes: int, max_s
             action=action,
             pursuits=pursuits,
             event=event,
+            attained=attained,
         )
         yield frame
         tensordict = env.step(tensordict)
         after = tensordict["next"][0]
         pursuits = tuple(replace(pursuit, steps=pursuit.steps + 1) for pursuit in pursuits)
-        score, event = _add(score, own, after), _tell(frame, above, after)
+        score, event, attained = _add(score, own, after), _tell(frame, above, after), tuple(_attained(after))
         if after[keys.DONE] or step + 1 == longest:
-            frame = replace(frame, score=score, event=event, pursuits=pursuits, success=_happened(after, task.success))
+            success = _happened(after, task.success)
+            frame = replace(frame, score=score, event=event, attained=attained, pursuits=pursuits, success=success)
             subgoal = pursuits[-1].decision.choice if draws_subgoals else None
             yield _last(frame, base, subgoal, after)
             return

@@ -86,6 +86,7 @@ class Frame:
         action: Q-values of actions, and the action.
         pursuits: subgoals in force, from near to far; none for flat agents.
         event: what the step before did; empty if nothing of note.
+        attained: subgoals that the step before attained ``[G]``, of the farthest set.
         outcome: how the episode ended; empty while it is played.
         success: whether it ended with the whole task completed.
 
@@ -111,6 +112,7 @@ class Frame:
     action: Decision
     pursuits: tuple[Pursuit, ...] = ()
     event: str = ""
+    attained: tuple[bool, ...] = ()
     outcome: str = ""
     success: bool = False
 

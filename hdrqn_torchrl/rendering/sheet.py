@@ -71,11 +71,11 @@ def subgoal_records(frames: Sequence[Frame]) -> list[SubgoalRecord]:
         if before.outcome:
             continue
         choice = before.pursuits[-1].decision.choice
+        if after.attained[choice]:
+            options[choice][-1] = (options[choice][-1][0], True)
         for subgoal, (was, now) in enumerate(zip(before.score.reached, after.score.reached, strict=True)):
             if now and not was:
                 moments[subgoal].append((before, after))
-                if subgoal == choice:
-                    options[choice][-1] = (options[choice][-1][0], True)
     played = frames[-1].episode
     return [
         SubgoalRecord(

@@ -30,8 +30,8 @@ class SubgoalTransform(Transform):
        ``wrong_subgoal_reward`` if another subgoal was attained;
     4. ``option_return`` grows by :math:`\gamma^{k} r^{ex}`, ``option_steps`` :math:`= k + 1`;
     5. ``option_done`` = reached, or the episode is done, or ``max_option_steps`` are over, or :math:`g` can no
-       longer be chosen, or the option of the level above is done; ``option_terminated`` = reached or the episode
-       terminated.
+       longer be chosen, or the option of the level above is done; ``option_terminated`` = reached, or lost (:math:`g`
+       could be chosen before this step, cannot after it, and was not attained), or the episode terminated.
 
     The policy's ``subgoal`` becomes an additional action. Put every transform that can end an episode
     (``StepCounter(max_steps)``) *before* this one, so that each end of an episode closes its option.
@@ -155,6 +155,7 @@ class SubgoalTransform(Transform):
         attained = next_tensordict.get(self.attained_key)
         hazard = None if self.hazard_key is None else next_tensordict.get(self.hazard_key)
         reached = attained.gather(-1, chosen)
+        terminated = reached | next_tensordict.get(self.terminated_key)
         done = reached | next_tensordict.get(self.done_key)
         if self.upper_done_key is not None:
             done = done | next_tensordict.get(self.upper_done_key)
@@ -162,7 +163,9 @@ class SubgoalTransform(Transform):
             done = done | (steps >= self.max_option_steps)
         if self.available_key is not None or not self.repeatable:
             left = mask & ~attained if self.available_key is None else next_tensordict.get(self.available_key).clone()
-            done, mask = done | ~(mask & left).gather(-1, chosen), left
+            was, stays = mask.gather(-1, chosen), left.gather(-1, chosen)
+            lost = was & ~stays & ~reached & ~next_tensordict.get(self.done_key)
+            done, terminated, mask = done | ~(was & stays), terminated | lost, left
 
         for key, value in (
             (self.option_init_key, done),
@@ -172,7 +175,7 @@ class SubgoalTransform(Transform):
             (self.option_return_key, collected),
             (self.subgoal_reached_key, reached),
             (self.option_done_key, done.clone()),
-            (self.option_terminated_key, reached | next_tensordict.get(self.terminated_key)),
+            (self.option_terminated_key, terminated),
             (self.intrinsic_reward_key, self.reward.of(attained, reached, hazard)),
         ):
             next_tensordict.set(key, value)

@@ -210,6 +210,7 @@ class TestTable:
 
     def test_hierarchical_agents_have_no_bonus_to_tell_of(self):
         labels = [table.label_of(evaluation(0, 0.0, agent=agent, bonus=0.0)) for agent in table.AGENTS]
+        assert table.label_of(evaluation(0, 0.0, agent="recurrent_ppo", bonus=0.1)).endswith(", bonus 0.1")
         assert labels[:3] == ["hDRQNv3", "hDRQNv3, three levels", "v3 without hierarchy, no bonus"]
 
     def test_agents_without_probabilities_have_no_success_with_drawn_actions(self, results):

@@ -110,6 +110,14 @@ def test_wrong_arguments_are_reported(call, arguments, part):
         call(*arguments)
 
 
+@pytest.mark.parametrize("name", ["config.yaml", "metrics.csv"])
+def test_no_file_of_a_run_is_written_over(call, run, name):
+    before = (run / name).read_bytes()
+    with pytest.raises(SystemExit, match="out must not be a file that a run consists of"):
+        call(f"run={run}", "episodes=8", f"out={run / name}")
+    assert (run / name).read_bytes() == before
+
+
 def test_results_come_before_figures_and_survive_them(run, monkeypatch, capsys, tmp_path):
     def fail(*_):
         raise OSError("no room")

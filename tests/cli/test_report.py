@@ -175,6 +175,18 @@ def test_runs_that_are_left_out_for_others_are_named(run, outputs, tmp_path, mon
     assert len(told) == 1 and re.search(r" \(1\): kept/runs\.tar\.xz: [\w-]+$", told[0])
 
 
+def test_the_part_of_a_study_without_any_run_stays_as_it_is(run, outputs, tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(report, "note", told.append)
+    run("runs=outputs", "out=a.md")
+    before = Path("a.md").read_text()
+    (tmp_path / "empty").mkdir()
+    make_run(tmp_path / "other/dqn", "env=gridworld", "algo=dqn", "seed=77", "total_frames=999")
+    run("runs=other", "out=a.md")
+    assert Path("a.md").read_text() == before and "| dqn |" in before
+    assert "note: gridworld: none of its runs is there, so its part of a.md stays as it is" in told
+
+
 @text_only
 class TestArchive:
     def test_it_holds_the_runs_of_all_studies_and_sizes(self, run, outputs, tmp_path):

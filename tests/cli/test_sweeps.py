@@ -106,6 +106,15 @@ def test_a_job_that_goes_on_is_noted_with_the_folder_of_its_run(tmp_path):
         assert note["folder"] == str(run.relative_to(tmp_path)) and note["state"] == ledger.DONE
 
 
+def test_jobs_of_one_sweep_do_not_go_on_with_each_other(tmp_path):
+    common = [each for each in COMMON if not each.startswith(("hydra.", "total_frames"))]
+    arguments = ["-m", *common, "output_root=runs", "resume=auto", "total_frames=300,600"]
+    for _ in range(2):  # the second finds the first one's runs, each its own
+        assert run_script(tmp_path, *arguments)[0] == 0
+    runs = [json.loads(path.read_text())["frames"] for path in tmp_path.glob("runs/*/*/summary.json")]
+    assert len(runs) == 2 and sorted(frames // 300 for frames in runs) == [1, 2]
+
+
 def test_a_search_maximises_and_survives_failed_trials(tmp_path):
     # Without -m: sweep=search alone says that this is a sweep.
     search = ["sweep=search", "hydra.sweeper.n_trials=4", "algo.gamma=choice(0.9,7)", "algo.sub.tau=0.02"]

@@ -32,7 +32,9 @@ from hdrqn_torchrl.runs.interruption import Interrupted, StopRequest
 from hdrqn_torchrl.runs.logging import CSVLog
 from hdrqn_torchrl.runs.persistence.durable import verify
 from hdrqn_torchrl.runs.persistence.folder import locked
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 from hdrqn_torchrl.runs.settings.building import build, build_algorithm
+from hdrqn_torchrl.runs.settings.reading import read_config
 
 SUMMARY = (
     "return_mean", "success_rate", "in_order_rate", "steps_mean", "episodes", "frames", "updates", "wall_seconds",
@@ -432,6 +434,30 @@ class TestWhatIsLeftAlone:
         assert "resume must name a run that has checkpoints" in told[-1] and remedy in told[-1]
         assert snapshot(a_run) == before
 
+    def test_measurements_of_a_run_that_had_checkpoints_are_not_overwritten(self, a_run):
+        shutil.rmtree(a_run / "checkpoints")
+        (a_run / "summary.json").unlink()
+        with (a_run / "metrics.csv").open("a") as file:
+            file.write("3000000,")
+        before = snapshot(a_run)
+        told = self.refused(a_run.parent, "resume=run")
+        assert "its metrics.csv would be void" in told[-1]
+        assert snapshot(a_run) == before
+
+    def test_a_new_run_in_a_folder_with_files_of_the_same_names_is_refused(self, tmp_path):
+        (tmp_path / "run").mkdir()
+        (tmp_path / "run" / "summary.json").write_text("mine")
+        told = self.refused(tmp_path, *SHORT, "hydra.run.dir=run")
+        assert "holds no run, but summary.json, which would be overwritten" in told[-1]
+        assert (tmp_path / "run" / "summary.json").read_text() == "mine"
+
+    def test_a_run_that_another_process_has_begun_meanwhile_is_refused(self, a_run):
+        settings = read_config(a_run)
+        before = snapshot(a_run)
+        with pytest.raises(SettingsError, match="already holds a run"):
+            training.begin(Plan(a_run, settings, {}, resumed=False))
+        assert snapshot(a_run) == before
+
     def test_resuming_an_older_checkpoint_is_refused_while_there_are_newer_ones(self, a_run):
         before = snapshot(a_run)
         told = self.refused(a_run.parent, "resume=run/checkpoints/checkpoint-000000000512")
@@ -507,6 +533,8 @@ class TestFailures:
     def test_a_run_that_was_killed_before_its_first_checkpoint_starts_again(self, a_run, finished):
         shutil.rmtree(a_run / "checkpoints")
         (a_run / "summary.json").unlink()
+        rows = (a_run / "metrics.csv").read_text().splitlines(keepends=True)
+        (a_run / "metrics.csv").write_text("".join(rows[:2]))
         (a_run / "metrics.partial").write_text("half")
         code, _, told = run_script(a_run.parent, "resume=run")
         assert code == 0 and "run has no checkpoint to go on from: it begins anew" in told, told

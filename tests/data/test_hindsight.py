@@ -112,11 +112,11 @@ class TestRelabelSubgoals:
                 {"pursued": "0000", "reward": [0.0, 0.0, -1.0, -0.5], "init": "0123", "done": "0123", "terminated": "3",
                  "eligible": ""},
             ),
-            # It can't be chosen for a while: the option ends there, and another one starts when it can again.
+            # It can't be chosen for a while: the option ends there without a reward; another starts when it can again.
             (
                 {"pursued": "111111", "attained": "00 00 00 00 00 00", "mask": "11 11 01 01 11 11", "init": "0",
                  "done": "", "reward": [0.0] * 6},
-                {"pursued": "000000", "reward": [0.0] * 6, "init": "0234", "done": "123", "terminated": "",
+                {"pursued": "000000", "reward": [0.0] * 6, "init": "0234", "done": "123", "terminated": "1",
                  "eligible": "0145"},
             ),
             # The subgoal that was pursued can't be chosen for a while: that ends its option, but none for goal 0.

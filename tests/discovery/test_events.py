@@ -60,6 +60,15 @@ def test_what_happens_again_in_many_episodes_is_not_attained_once():
     assert selection.update().once == []
 
 
+def test_a_slot_stays_attained_once_when_its_event_has_become_part_of_another():
+    selection = make_selection()
+    selection.observe(episodes(*[[(5, SHADE, MOVE, 1.0)]] * 10))
+    assert selection.update().once == [1]
+    selection.observe(episodes(*[[(5, KEY, MOVE, 1.0), (5, SHADE, MOVE, 1.0)]] * 200))
+    chosen = selection.update()
+    assert chosen.slots == {SHADE: 1, KEY: 2} and chosen.once == [1, 2]
+
+
 def test_what_costs_is_no_subgoal():
     hazard = torch.zeros(6, T, 1, dtype=torch.bool)
     hazard[:, 4] = True

@@ -166,7 +166,10 @@ class Reference:
         return reward + self.s["hazard_reward"] * self.flag("hazard", b, t)
 
     def ends(self, level, c, b, t):
-        return self.flag("terminated", b, t) or (level < self.levels - 1 and self.attained(level + 1, c, b, t))
+        over = level < self.levels - 1 and (
+            self.attained(level + 1, c, b, t) or (self.lost(level + 1, c, b, t) and not self.cut_off(b, t))
+        )
+        return self.flag("terminated", b, t) or over
 
     def gamma(self, level):
         if level == 0:
@@ -181,8 +184,7 @@ class Reference:
         return self.target[level][b * T + t, c, x].item()
 
     def unknown(self, level, c, b, t):
-        lost = level < self.levels - 1 and self.lost(level + 1, c, b, t)
-        return (self.cut_off(b, t) or lost) and not self.ends(level, c, b, t)
+        return self.cut_off(b, t) and not self.ends(level, c, b, t)
 
     def y(self, level, c, x, b, t):
         reward = self.reward(level, c, b, t)
@@ -353,10 +355,10 @@ def test_targets_count_on_no_action_that_cannot_be_chosen():
 @pytest.mark.parametrize(
     ("lost", "sub", "middle", "meta"),
     [
-        # After the first step the near subgoal can't be pursued, so nothing says what either step is worth for it, nor
-        # what the second is worth for the middle level if it chooses it; it chooses the other one: 0.5 * 0.9.
-        ("near", [None, None], [0.5 * 0.9, None], [1.5, 2.0]),
-        ("", [0.3, 0.4], [None, None], [0.5 * 5.0, None]),
+        # After the first step the near subgoal can't be pursued: that step is worth nothing for it. The second is not
+        # trained for it, nor for the middle level's choosing it; that chooses the other one: 0.5 * 0.9.
+        ("near", [0.0, None], [0.5 * 0.9, None], [1.5, 2.0]),
+        ("", [0.3, 0.4], [0.0, None], [0.5 * 5.0, None]),
     ],
 )
 def test_an_option_whose_subgoal_is_lost_is_followed_by_the_best_that_is_left(lost, sub, middle, meta):

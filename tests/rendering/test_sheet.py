@@ -1,12 +1,16 @@
 """A sheet of subgoals is read from recorded episodes."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from gym_toys import Counter
+from gymnasium.wrappers import TimeLimit
 from hand_given import BOTH_GOALS, HandGiven
 from helpers import build, small_env
 
+from hdrqn_torchrl.envs import Subgoals, make_gym
 from hdrqn_torchrl.rendering import draw_sheet, record_episodes, subgoal_records
 
 
@@ -36,6 +40,23 @@ def test_records_count_options_and_the_episodes_that_attained_each_subgoal(frame
     assert sum(each.options for each in (explore, *goals, free)) == len(started)
     assert (free.episodes, free.options, free.moments) == (0.0, 0, ()) and math.isnan(free.value)
     assert not explore.moments
+
+
+def test_every_option_that_attained_its_subgoal_counts_where_it_can_be_attained_again():
+    class Steps(Subgoals):
+        names = ("one", "two")
+        repeatable = True
+
+        def conditions(self, env, before, after, info):
+            return [before is not None and after[0] - before[0] == size for size in (1, 2)]
+
+    env = make_gym(lambda: TimeLimit(Counter(ends=False), 30), 1, subgoals=Steps(), seed=0)
+    agent = build("v2", env)
+    frames = record_episodes(agent.transform(env), agent, episodes=2, epsilon=1.0)
+    pairs = [(before, after) for before, after in pairwise(frames) if not before.outcome]
+    attained = sum(after.attained[before.pursuits[-1].decision.choice] for before, after in pairs)
+    records = subgoal_records(frames)
+    assert attained > 8 and sum(record.reached * record.options for record in records) == pytest.approx(attained)
 
 
 def test_moments_are_frames_before_and_after_the_step(frames):

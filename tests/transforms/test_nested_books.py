@@ -77,14 +77,15 @@ class Book:
         self.steps += 1
         attained = after[self.prefix + "attained"].tolist()
         reached, terminated = attained[self.subgoal], after["terminated"].item()
-        gone, reward = not self.mask[self.subgoal], self.book.reward
+        was, reward = self.mask[self.subgoal], self.book.reward
         intrinsic = reward.reached * reached + reward.hazard * after["hazard"].item()
         intrinsic += reward.wrong_subgoal * (sum(attained) > reached)
         if self.book.available_key:
             self.mask = after[self.book.available_key].tolist()
         elif not self.book.repeatable:
             self.mask = [left and not now for left, now in zip(self.mask, attained, strict=True)]
-        gone = gone or not self.mask[self.subgoal]
+        gone = not was or not self.mask[self.subgoal]
+        terminated = terminated or (was and gone and not reached and not after["done"].item())
         done = reached or gone or upper_done or after["done"].item() or self.steps >= self.book.max_option_steps
         self.init = done
         values = (done, self.subgoal, self.mask, self.steps, self.collected, reached, done, reached or terminated)

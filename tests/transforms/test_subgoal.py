@@ -143,7 +143,7 @@ class TestArguments:
         steps = play([1, 1, 1, 0], [LEFT] * 4, before=[Availability()], available_key="available")
         assert column(steps, "option_done") == [0, 1, 1, 0]  # who chooses it all the same has it for one step
         assert column(steps, "option_steps") == [1, 2, 1, 1]
-        assert column(steps, "option_terminated") == [0, 0, 0, 0]
+        assert column(steps, "option_terminated") == [0, 1, 0, 0]  # who loses it has failed
 
     def test_reaching_the_subgoal_is_not_penalised_as_a_wrong_one(self):
         assert column(play([0, 0], wrong_subgoal_reward=-0.5), "intrinsic_reward") == [-1.0, 1.0]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
+import gymnasium
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 from numpy.typing import NDArray
 
@@ -145,14 +147,18 @@ class GivenWorlds(_WithoutState):
         shown, info = self.vector.reset(seed=self._seed, options=None if mask.all() else {"reset_mask": mask.copy()})
         self._seed = None
         for index in chosen:
-            self._begun[index] = self._worlds[index].begin(_row(shown, index), _info_of(info, index))
+            self._begun[index] = self._worlds[index].begin(self._shown(shown, index), _info_of(info, index))
+
+    def _shown(self, batch: Any, index: int) -> Any:
+        """What one world shows."""
+        return _row(batch, index, self.vector.single_observation_space)
 
     def step(self, actions: NDArray[np.int64]) -> Outcome:
         """See :class:`Worlds`."""
         shown, reward, terminated, truncated, info = self.vector.step(actions)
         rewards, same_step = np.zeros(len(self._worlds), np.float32), self._mode == AutoresetMode.SAME_STEP
         for index, world in enumerate(self._worlds):
-            after, told = _row(shown, index), _info_of(info, index)
+            after, told = self._shown(shown, index), _info_of(info, index)
             begun, about_begun = after, told
             if resets := same_step and (terminated[index] or truncated[index]):
                 after, told = told["final_obs"], told.get("final_info", {})
@@ -213,12 +219,13 @@ class PooledWorlds(_WithoutState):
         return {**told, keys.ACTION_MASK: part[self._mask.name][index]}
 
 
-def _row(batch: Any, index: int) -> Any:
-    """One world's part of observations."""
+def _row(batch: Any, index: int, space: gymnasium.Space | None = None) -> Any:
+    """One world's part of observations; a tuple holds worlds unless the ``space`` of one world is a ``Tuple``."""
     if isinstance(batch, Mapping):
-        return {key: _row(part, index) for key, part in batch.items()}
-    if isinstance(batch, tuple) and not isinstance(batch, str):
-        return tuple(_row(part, index) for part in batch) if isinstance(batch[0], np.ndarray) else batch[index]
+        of = space.spaces if isinstance(space, spaces.Dict) else {}
+        return {key: _row(part, index, of.get(key)) for key, part in batch.items()}
+    if isinstance(space, spaces.Tuple):
+        return tuple(_row(part, index, each) for part, each in zip(batch, space.spaces, strict=True))
     return batch[index]
 
 

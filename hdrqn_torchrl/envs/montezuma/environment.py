@@ -29,7 +29,7 @@ from hdrqn_torchrl.envs.montezuma.screen import (
 from hdrqn_torchrl.envs.montezuma.task import check_settings, montezuma_task
 from hdrqn_torchrl.envs.specs import episode_ends, flags, rewards
 
-_LONGEST_DEATH = 40  # steps from an impact to the next life
+_LONGEST_DEATH = 160  # frames from an impact to the next life
 
 
 class MontezumaEnv(EnvBase):
@@ -107,6 +107,7 @@ class MontezumaEnv(EnvBase):
         self._near = keys.OptionKeys("places" if key_and_door else "")
         self.num_envs, self.max_steps, self.actions, self.one_life = num_envs, max_steps, tuple(actions), one_life
         self.locator, self.noops, self.practice, self.practice_steps = locator, noops, practice, practice_steps
+        self._longest_death = -(-_LONGEST_DEATH // frame_skip)
         self.emulators = Emulators("montezuma_revenge", num_envs, frame_skip=frame_skip, sticky=sticky, threads=threads)
         self.ram = Ram(self.emulators.ram)
         self._is_door = np.array([name in DOORS for name in self.subgoals])
@@ -224,7 +225,7 @@ class MontezumaEnv(EnvBase):
 
     def _wait_for_next_life(self, index: int) -> bool:
         """Does nothing while an agent dies; returns whether that was its last life."""
-        for _ in range(_LONGEST_DEATH):
+        for _ in range(self._longest_death):
             if self.emulators.is_over(index) or not self.ram.lies_dead()[index]:
                 break
             self.emulators.act_alone(index, 0)

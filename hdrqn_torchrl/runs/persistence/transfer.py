@@ -22,7 +22,8 @@ def find_weights(place: Path, which: str = "best") -> Path:
     """The checkpoint or file that holds the weights that a user means.
 
     Args:
-        place: a run folder, a checkpoint, or a file of :func:`~hdrqn_torchrl.runs.persistence.weights.save_weights`.
+        place: a run folder, that of an agent of a zoo, a checkpoint, or a file of
+            :func:`~hdrqn_torchrl.runs.persistence.weights.save_weights`.
         which: ``"best"`` or ``"last"`` of a run folder's checkpoints.
 
     Returns:
@@ -36,6 +37,8 @@ def find_weights(place: Path, which: str = "best") -> Path:
             return place
         checkpoints = Checkpoints(place / layout.CHECKPOINTS)
         path = checkpoints.best() if which == "best" else checkpoints.newest()
+        if path is None and (place / layout.WEIGHTS).is_file():  # an agent of a zoo
+            return place / layout.WEIGHTS
     except (CheckpointError, OSError) as error:
         raise ValueError(f"init_from can't be read: {error}") from error
     if path is None:

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 import torch
 from gym_toys import Counter, CountingResets, Forgetful, Milestones, Remembering
+from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit, TransformObservation
 from torchrl.envs.utils import check_env_specs
@@ -116,6 +117,24 @@ class TestRules:
         )
         for each in (step, step["next"]):
             assert torch.equal(each["action_mask"][..., 1:], each["observation"][..., :1] % 2 == 0)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_worlds_of_a_vector_made_elsewhere_keep_their_tuples(nested):
+    """As many parts as there are worlds, so that nothing but the space tells them apart."""
+    part = spaces.Box(-9.0, 9.0, (2,), np.float32)
+
+    class InTuples(Counter):
+        observation_space = spaces.Tuple((spaces.Tuple((part, part)),) * 2) if nested else spaces.Tuple((part, part))
+
+        def _shown(self):
+            one = tuple(super(InTuples, self)._shown() - number for number in range(2))
+            return (one, one) if nested else one
+
+    vector = SyncVectorEnv([InTuples] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
+    shown = make_gym(vector, 2, seed=0).reset()["observation"]
+    rows = [[env.count, 0.0, env.count - 1.0, -1.0] * (1 + nested) for env in vector.envs]
+    assert shown.tolist() == rows
 
 
 def test_subgoals_see_both_observations_of_an_environment_that_writes_into_one_array():

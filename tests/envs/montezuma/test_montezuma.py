@@ -141,6 +141,12 @@ class TestDeath:
         assert steps["position"][died].tolist() == [79.5, 82.5]
         assert not steps["hazard"][died + 1]
 
+    def test_a_death_is_one_also_if_every_frame_is_a_step(self):
+        env = MontezumaEnv(1, seed=0, one_life=False, frame_skip=1, max_steps=1000)
+        steps = play(env, [4] * 60)
+        (died,) = steps["hazard"].squeeze(-1).nonzero().flatten().tolist()
+        assert steps["position"][died].tolist() == [79.5, 82.5]
+
     def test_the_last_life_ends_the_game(self):
         env = MontezumaEnv(1, seed=0, one_life=False, max_steps=1000)
         steps = play(env, [4] * 200)

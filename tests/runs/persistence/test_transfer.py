@@ -100,6 +100,12 @@ class TestFinding:
             assert weights.keys() == expected.keys()
             assert all((value == expected[key]).all() for key, value in weights.items())
 
+    def test_the_folder_of_an_agent_that_has_weights_alone_will_do(self, run, tmp_path):
+        folder = tmp_path / "agent"
+        folder.mkdir()
+        save_weights(build("v2", small_env(2)).policy, folder / "weights.safetensors")
+        assert find_weights(folder) == folder / "weights.safetensors"
+
     def test_a_path_without_weights_is_refused(self, tmp_path):
         with pytest.raises(ValueError, match="init_from must be a run folder, a checkpoint or a weights file, got"):
             find_weights(tmp_path / "nothing")
