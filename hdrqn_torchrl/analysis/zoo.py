@@ -79,7 +79,8 @@ def check_new(name: str, zoo: Path, run: Path) -> None:
         raise ValueError(f"name must be that of one folder, got {name!r}; for example gridworld-v3.")
     if folder.resolve() in (run.resolve(), *run.resolve().parents):
         raise ValueError(f"name must not be that of the run's own folder, got {name!r}; its files would be lost.")
-    if folder.exists() and (not (folder / layout.CARD).is_file() or layout.holds_training(folder)):
+    is_agent = (folder / layout.CARD).is_file() and not folder.is_symlink()
+    if folder.exists() and (not is_agent or layout.holds_training(folder)):
         raise ValueError(
             f"name must be a new one, or that of an agent, which is then replaced, got {name!r}: {folder} holds "
             "something else, which would be lost; choose another name."

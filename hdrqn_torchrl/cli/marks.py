@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import re
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 
 def part_of(text: str, mark: str) -> str:
@@ -24,12 +24,20 @@ def put(text: str, mark: str, part: str) -> str:
         mark: name of the part.
         part: what it is to hold.
 
+    Raises:
+        SettingsError: if one of the marks is missing, or there more than once: what is between could be anybody's.
+
     Examples:
         >>> put("before <!-- a -->\\nold\\n<!-- end of a --> after", "a", "new")
         'before <!-- a -->\\nnew\\n<!-- end of a --> after'
     """
     begin, end = f"<!-- {mark} -->", f"<!-- end of {mark} -->"
-    marked = f"{begin}\n{part}\n{end}"
-    if begin not in text:
+    marked, numbers = f"{begin}\n{part}\n{end}", (text.count(begin), text.count(end))
+    if numbers == (0, 0):
         return f"{text.rstrip()}\n\n{marked}\n"
-    return re.sub(f"{re.escape(begin)}.*?{re.escape(end)}", lambda _: marked, text, flags=re.DOTALL)
+    if numbers != (1, 1) or text.index(begin) > text.index(end):
+        raise SettingsError(
+            f"a page must have {begin} once and {end} once, behind it, got {numbers[0]} and {numbers[1]} of them; mend "
+            "the marks, or remove them."
+        )
+    return text.partition(begin)[0] + marked + text.partition(end)[2]

@@ -82,8 +82,8 @@ def run(settings: Settings) -> None:
         check_archive(settings.keep, patterns)
     out = Path(settings.out)
     out.with_suffix("").mkdir(parents=True, exist_ok=True)
-    text = out.read_text() if out.exists() else "# Results\n"
     left: list[str] = []
+    parts: dict[str, str] = {}
     overview = [CLAIMS.replace("|", "| study |", 1).replace("|---", "|---|---", 1)]
     with ExitStack() as stack:
         runs = read_runs(patterns, stack)
@@ -92,22 +92,29 @@ def run(settings: Settings) -> None:
             if study.name in wanted and settings.size in study.sizes:
                 matched = runs_of_jobs(study.name, settings.size, runs)
                 mark = f"{study.name} {settings.size}"
-                if not matched.runs and "\n|" in part_of(text, mark):
+                if not matched.runs and "\n|" in part_of(_page(out), mark):
                     note(f"note: {study.name}: none of its runs is there, so its part of {out} stays as it is")
                     left.append(study.name)
                     continue
                 part, claims = section(study, matched, everywhere, settings)
-                text = put(text, mark, part)
+                parts[mark] = part
                 overview += [f"| {study.title} {line}" for line in claims]
                 print(f"{study.name}: runs {len(matched.runs)}, missing {matched.missing}")
                 tell_of_others(study, matched)
         if left:
             note(f"note: the table of all claims in {out} stays as it is, too")
         elif not settings.studies:
-            text = put(text, f"claims {settings.size}", "\n".join(overview))
+            parts[f"claims {settings.size}"] = "\n".join(overview)
         if settings.keep:
             keep_runs(runs, Path(settings.keep))
+    text = _page(out)  # only now: figures take a while, in which the author may write
+    for mark, part in parts.items():
+        text = put(text, mark, part)
     write_whole(out, text)
+
+
+def _page(out: Path) -> str:
+    return out.read_text() if out.exists() else "# Results\n"
 
 
 def tell_of_others(study: Study, matched: Matched) -> None:

@@ -24,6 +24,7 @@ Nothing in such a folder can run code.
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import sys
 from collections.abc import Sequence
@@ -141,7 +142,8 @@ def add(settings: Settings) -> None:
         raise SettingsError(f"run must be that of a finished training, got {settings.run} ({error}).") from error
     size = (zoo / settings.name / layout.WEIGHTS).stat().st_size
     print(f"{card.name}: {size / 1000:.0f} kB, {'16' if card.half else '32'} bits, {card.figures}")
-    print(as_called("python zoo.py page") + "  # shows it in docs/zoo.md")
+    place = "" if zoo == FOLDER else f" zoo={shlex.quote(str(zoo))}"
+    print(as_called(f"python zoo.py page{place}") + f"  # shows it in {zoo.parent / 'docs/zoo.md'}")
 
 
 def write_page(settings: Settings) -> None:

@@ -175,6 +175,20 @@ def test_runs_that_are_left_out_for_others_are_named(run, outputs, tmp_path, mon
     assert len(told) == 1 and re.search(r" \(1\): kept/runs\.tar\.xz: [\w-]+$", told[0])
 
 
+def test_what_an_author_writes_meanwhile_stays(run, outputs, monkeypatch):
+    run("runs=outputs", "out=a.md", "studies=gridworld")
+    section = report.section
+
+    def write(*arguments):
+        with Path("a.md").open("a") as file:
+            file.write("mine\n")
+        return section(*arguments)
+
+    monkeypatch.setattr(report, "section", write)
+    run("runs=outputs", "out=a.md", "studies=gridworld")
+    assert Path("a.md").read_text().endswith("mine\n")
+
+
 def test_the_part_of_a_study_without_any_run_stays_as_it_is(run, outputs, tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr(report, "note", told.append)
