@@ -121,8 +121,12 @@ def differences(entries: Sequence[Entry]) -> list[str]:
 
 
 def _compared(settings: dict[str, Any]) -> dict[str, Any]:
-    """By full names; of the environment only what does not belong to the task, such as how many worlds there are."""
-    found = flat(settings, without=NOT_COMPARED)
+    """By full names; of the environment only what does not belong to the task, such as how many worlds there are, and
+    of evaluations what changes what they measure."""
+    found, evaluation = flat(settings, without=NOT_COMPARED), settings.get("evaluation") or {}
+    for name in ("env", "max_steps"):
+        if evaluation.get(name):
+            found |= flat(evaluation[name], path=f"evaluation.{name}")
     kept = ["env.num_envs", *(f"env.{name}" for name in NOT_THE_WORLDS if id_of(settings) is not None)]
     return {key: value for key, value in found.items() if not key.startswith("env.") or key in kept}
 
@@ -134,7 +138,9 @@ def _labels(entries: Sequence[Entry], by: Sequence[str]) -> list[str]:
     short = Counter(key.rpartition(".")[2] for key in by)
     columns = []
     for key in by:
-        values = _run_names(entries) if key == "run" else [value_of(entry, key) for entry in entries]
+        values = [value_of(entry, key) for entry in entries] if key != "run" else _run_names(entries)
+        if key == "env":
+            values = _task_names(entries, values, by)
         if set(values) == {NONE} and any(entry.settings for entry in entries):
             raise ValueError(
                 f"by must name algo, env, network, run or a setting of the runs, got {key!r}, which none of them has; "
@@ -150,6 +156,17 @@ def _run_names(entries: Sequence[Entry]) -> list[str]:
     """Run folders, without what all of them have in common."""
     parent = Path(os.path.commonpath([entry.run.folder.parent for entry in entries]))
     return [str(entry.run.folder.relative_to(parent)) for entry in entries]
+
+
+def _task_names(entries: Sequence[Entry], names: Sequence[str], by: Sequence[str]) -> list[str]:
+    """Names of tasks, with what tells those of one name apart, but for the settings that stand in ``by`` themselves."""
+    compared = {key.removeprefix("env.") for key in by if key.startswith("env.")}
+    tasks: dict[str, list[Entry]] = {}
+    for entry in entries:
+        tasks.setdefault(task_key(entry, compared), []).append(entry)
+    titles = dict(zip(tasks, _titles(list(tasks.values()), compared), strict=True))
+    found = [titles[task_key(entry, compared)] for entry in entries]
+    return [name if name == NONE else title for name, title in zip(names, found, strict=True)]
 
 
 def _names_a_file(key: str, entries: Sequence[Entry]) -> bool:

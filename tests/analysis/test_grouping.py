@@ -19,6 +19,20 @@ def labels(entries, *by, **options):
     return {row.title: list(row.groups) for row in rows_of(entries, by, **options)}
 
 
+def test_tasks_of_one_name_are_not_averaged_by_env():
+    choices = {"env": "gridworld", "algo": "v2"}
+    entries = [entry(choices=choices, env={"view": view}) for view in (3, 5, 5)]
+    assert labels(entries, "env") == {"gridworld": ["gridworld, view=3", "gridworld, view=5"]}
+    assert labels(entries, "env", "env.view") == {"gridworld": ["gridworld, view=3", "gridworld, view=5"]}
+    assert labels(entries[1:], "env") == {"gridworld": ["gridworld"]}
+
+
+def test_runs_that_were_evaluated_on_other_tasks_are_told():
+    plain, other = entry(evaluation={"env": {}}), entry(evaluation={"env": {"layout": "four_rooms"}, "episodes": 3})
+    assert differences([plain, other]) == ["evaluation.env.layout"]
+    assert differences([plain, entry()]) == []
+
+
 class TestGroups:
     def test_the_choices_of_the_run_name_the_groups(self):
         first, second, third = (entry(choices={"env": "gridworld", "algo": algo}) for algo in ("v2", "dqn", "v2"))
