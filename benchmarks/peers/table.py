@@ -93,7 +93,7 @@ def rows_of(task: str, groups: Groups, axis: str) -> list[str]:
     end = shared_end(groups, axis)
     rows = []
     for agent, runs in groups.items():
-        figures = [_cell(values_at(runs, axis, name, np.array([end])), form) for name, (_, form) in FIGURES.items()]
+        figures = [_cell(values_at(runs, axis, name, np.array([end])), name) for name in FIGURES]
         rows.append(_row([f"`{task}`", f"{end:,.0f} {UNITS[axis]}", agent, str(len(runs)), *figures]))
     return rows
 
@@ -102,11 +102,18 @@ def _row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _cell(values: NDArray[np.float64], form: str) -> str:
+def _interval(values: NDArray[np.float64], name: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of the means of ``[P, R]``; no further than a share can go."""
+    low, high = mean_interval(values)
+    return (np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)) if name.endswith("_rate") else (low, high)
+
+
+def _cell(values: NDArray[np.float64], name: str) -> str:
     """The mean of ``[1, R]`` with its interval."""
+    form = FIGURES[name][1]
     if np.isnan(values).any():
         return "-"
-    low, high = mean_interval(values)
+    low, high = _interval(values, name)
     mean = format(values.mean(), form)
     return mean if np.isnan(low[0]) else f"{mean} ({low[0]:{form}} to {high[0]:{form}})"
 
@@ -131,7 +138,7 @@ def _curve(panel: Axes, runs: Sequence[Run], axis: str, name: str, label: str) -
     places = np.linspace(0.0, min(getattr(run[-1], axis) for run in runs), 100)
     values = values_at(runs, axis, name, places)
     (line,) = panel.plot(places, values.mean(-1), label=label)
-    panel.fill_between(places, *mean_interval(values), color=line.get_color(), alpha=0.2)
+    panel.fill_between(places, *_interval(values, name), color=line.get_color(), alpha=0.2)
     if name == "success_rate":
         sampled = values_at(runs, axis, "sampled_success_rate", places)  # NaN, which draws nothing, if there is none
         panel.plot(places, sampled.mean(-1), "--", color=line.get_color(), linewidth=1)
