@@ -146,6 +146,13 @@ def train_with_diary(folder: Path, name: str, seed: int, settings: dict) -> None
 
     begin, training.build_run, training.begin = training.begin, build_run, noted_begin
     training.record, training.write_summary = lambda run: None, lambda *_: {"return_mean": 0.0}
-    config: Any = SimpleNamespace(threads=1, init_from=None, allowed_targets=[], resume_override=False)
+    config: Any = SimpleNamespace(
+        threads=1,
+        init_from=None,
+        allowed_targets=[],
+        resume_override=False,
+        checkpoint=SimpleNamespace(interval_frames=settings["checkpoint_frames"]),
+        log_frames=96,  # of helpers.py
+    )
     train.train(Plan(folder, config, {}, resumed=True))
     diary.note("done")

@@ -117,7 +117,7 @@ def begin(run: Plan, stop: StopRequest | None = None) -> tuple[Trainer, EnvBase,
         run = replace(run, weights=path)
     record(run)  # only now: settings that the checkpoint does not fit must not replace those of the run
     write_facts(run.folder, facts)
-    for name in layout.AT_THE_END if trainer.frames < run.config.total_frames else (layout.ERROR,):
+    for name in layout.AT_THE_END if trainer.frames < trainer.total_frames else (layout.ERROR,):
         remove(run.folder / name)
     return trainer, evaluation_env, players
 

@@ -31,7 +31,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hdrqn_torchrl.cli import watch as watching
+from hdrqn_torchrl.cli import recording
 from hdrqn_torchrl.cli.command_line import check_place, command_line
 from hdrqn_torchrl.cli.marks import put
 from hdrqn_torchrl.runs.persistence import layout
@@ -106,11 +106,11 @@ def copy(settings: Settings) -> None:
 
 def watch(settings: Settings) -> None:
     """Records an agent, with the program that does so for runs."""
-    watching.run(
-        watching.Settings(
+    recording.run(
+        recording.Settings(
             run=str(folder_of(settings)),
-            out=settings.out or watching.Settings.out,
-            episodes=settings.episodes or watching.Settings.episodes,
+            out=settings.out or recording.Settings.out,
+            episodes=settings.episodes or recording.Settings.episodes,
             seed=settings.seed,
             allowed_targets=settings.allowed_targets,
         )

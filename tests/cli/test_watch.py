@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 from processes import ROOT
 
-from hdrqn_torchrl.cli import watch
+from hdrqn_torchrl.cli import recording, watch
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.rendering import record_episodes, video
 from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
@@ -49,7 +49,7 @@ def command(monkeypatch, tmp_path, capsys):
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["watch.py", *map(str, arguments)])
-        watch.command_line(watch.Settings, watch.__doc__, watch.run)
+        watch.main()
         return capsys.readouterr().out
 
     return call
@@ -72,7 +72,7 @@ def test_every_algorithm_can_be_watched(algo, tmp_path, command):
 
 def test_settings_change_what_is_played(run, command, monkeypatch):
     kept = []
-    monkeypatch.setattr(watch, "write", lambda frames, path, fps: kept.append((frames, path, fps)))
+    monkeypatch.setattr(recording, "write", lambda frames, path, fps: kept.append((frames, path, fps)))
 
     def played(*arguments):
         command(f"run={run}", *arguments)
@@ -101,7 +101,7 @@ def test_frames_are_those_of_the_loaded_weights(run, tmp_path, command, monkeypa
     save_weights(algorithm.policy, tmp_path / "mine.safetensors")
     expected = record_episodes(algorithm.transform(env), algorithm, episodes=2, seed=5)
     kept = []
-    monkeypatch.setattr(watch, "write", lambda frames, path, fps: kept.extend(frames))
+    monkeypatch.setattr(recording, "write", lambda frames, path, fps: kept.extend(frames))
     command(f"run={run}", f"checkpoint={tmp_path / 'mine.safetensors'}", "episodes=2", "seed=5")
     assert [frame.action for frame in kept] == [frame.action for frame in expected]
     assert [frame.score for frame in kept] == [frame.score for frame in expected]
@@ -154,7 +154,7 @@ def test_wrong_settings_are_explained_and_write_nothing(run, command, arguments,
 
 
 def test_an_unwritable_place_is_found_before_playing(run, command, monkeypatch):
-    monkeypatch.setattr(watch, "record", lambda settings: pytest.fail("played first"))
+    monkeypatch.setattr(recording, "record", lambda settings: pytest.fail("played first"))
     Path("file").touch()
     assert "error: out must be a file that can be written, got 'file/episode.gif'" in error(
         command, f"run={run}", "out=file/episode.gif"

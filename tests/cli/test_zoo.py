@@ -14,7 +14,7 @@ from run_folders import write_run
 from safetensors.torch import load_file
 
 from hdrqn_torchrl.analysis.zoo import add_agent, disagreement, score
-from hdrqn_torchrl.cli import watch, zoo
+from hdrqn_torchrl.cli import recording, zoo
 from hdrqn_torchrl.cli.zoo import as_settings
 from hdrqn_torchrl.rendering import excerpt, record_episodes
 from hdrqn_torchrl.runs import load_agent
@@ -150,9 +150,11 @@ def test_agents_are_listed_and_copied(agents, tmp_path, monkeypatch, capsys):
 
 def test_an_agent_is_played_as_a_run_is(agents, monkeypatch):
     seen = []
-    monkeypatch.setattr(watch, "run", seen.append)
+    monkeypatch.setattr(recording, "run", seen.append)
     call("watch", "small-v2", f"zoo={agents}", "episodes=1", "seed=4", "out=a.mp4", "allowed_targets=[mine.Env]")
-    played = watch.Settings(run=str(agents / "small-v2"), out="a.mp4", episodes=1, seed=4, allowed_targets=["mine.Env"])
+    played = recording.Settings(
+        run=str(agents / "small-v2"), out="a.mp4", episodes=1, seed=4, allowed_targets=["mine.Env"]
+    )
     assert seen == [played]
 
 
