@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
@@ -96,8 +97,12 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
         if missing := OmegaConf.missing_keys(settings):
             raise SettingsError(f"{min(missing)} must be given: {min(missing)}=...; --help shows all settings.")
         run(replace(OmegaConf.to_object(settings), **texts))  # type: ignore[type-var]
+        sys.stdout.flush()
     except SettingsError as error:
         sys.exit(f"error: {error}")
+    except BrokenPipeError:  # whoever reads the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python would fail again as it ends
+        sys.exit(1)
 
 
 def _is_text(schema: type, key: str, value: str) -> bool:

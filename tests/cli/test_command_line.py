@@ -1,5 +1,7 @@
 """``key=value`` arguments of the programs that look at runs."""
 
+import subprocess
+import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +20,22 @@ class Settings:
     episodes: int = 10
     out: str | None = None
     files: Any = None
+
+
+def test_who_has_seen_enough_of_the_output_gets_no_traceback():
+    """As in ``zoo.py list | head -1``."""
+    code = (
+        "import dataclasses, sys\n"
+        "from hdrqn_torchrl.cli.command_line import command_line\n"
+        "Settings = dataclasses.make_dataclass('Settings', [('lines', int, 1)])\n"
+        "sys.argv = ['script.py', 'lines=100000']\n"
+        "command_line(Settings, '', lambda settings: [print(line) for line in range(settings.lines)])\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.readline()
+        process.stdout.close()
+        told = process.stderr.read()
+    assert process.returncode == 1 and told == b""
 
 
 class TestCommandLine:
