@@ -16,9 +16,10 @@ from omegaconf import OmegaConf, open_dict
 from run_folders import CONF, HOSTILE, REFUSED_WHEN_BUILT, SMALL
 
 from hdrqn_torchrl.cli import origin
+from hdrqn_torchrl.cli.changed_settings import differences
 from hdrqn_torchrl.cli.configuration import resolved
 from hdrqn_torchrl.cli.origin import record
-from hdrqn_torchrl.cli.resuming import Plan, command, differences, find_same, plan, with_groups_of_run
+from hdrqn_torchrl.cli.resuming import Plan, command, find_same, plan, with_groups_of_run
 from hdrqn_torchrl.runs.persistence.layout import holds_run, split
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 from hdrqn_torchrl.runs.settings.run_settings import as_plain, check

@@ -273,8 +273,10 @@ def _pooled(id: str | EnvFactory, num_envs: int, read: Callable, settings: Mappi
     """Worlds of EnvPool."""
     spec = spec_of(id, num_envs, settings)
     mask, limit = mask_place_of(spec), spec.config.max_episode_steps
-    reading, actions = read(spec.gymnasium_observation_space, spec.gymnasium_action_space, masked=mask is not None)
-    worlds = PooledWorlds(partial(pool_of, str(id), num_envs, dict(settings)), reading, num_envs, mask=mask)
+    space = spec.gymnasium_observation_space
+    reading, actions = read(space, spec.gymnasium_action_space, masked=mask is not None)
+    make = partial(pool_of, str(id), num_envs, dict(settings))
+    worlds = PooledWorlds(make, reading, num_envs, space=space, mask=mask)
     return _Made(worlds=worlds, reading=reading, actions=actions, max_steps=limit if 0 < limit < 2**31 - 1 else None)
 
 

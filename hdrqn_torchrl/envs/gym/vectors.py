@@ -176,13 +176,20 @@ class PooledWorlds(_WithoutState):
         make: makes a pool for a seed, with Gymnasium's interface.
         reading: how entries are read.
         num_envs: N.
+        space: of the observations of one world.
         mask: where pools tell which actions can be chosen; ``None``: nowhere.
     """
 
     def __init__(
-        self, make: Callable[[int], Any], reading: Reading, num_envs: int, *, mask: MaskPlace | None = None
+        self,
+        make: Callable[[int], Any],
+        reading: Reading,
+        num_envs: int,
+        *,
+        space: gymnasium.Space,
+        mask: MaskPlace | None = None,
     ) -> None:
-        self._make, self._mask = make, mask
+        self._make, self._space, self._mask = make, space, mask
         self.pool: Any = None  # until there is a seed
         self._worlds = [World(reading) for _ in range(num_envs)]
         self._rows: list[Entries] = [{} for _ in self._worlds]
@@ -198,7 +205,7 @@ class PooledWorlds(_WithoutState):
         chosen = mask.nonzero()[0].astype(np.int32)
         shown, info = self.pool.reset(chosen)
         for place, index in enumerate(chosen):
-            self._rows[index] = self._worlds[index].begin(_row(shown, place), self._told(shown, info, place))
+            self._rows[index] = self._worlds[index].begin(self._shown(shown, place), self._told(shown, info, place))
         return _stacked(self._rows)
 
     def step(self, actions: NDArray[np.int64]) -> Outcome:
@@ -207,8 +214,12 @@ class PooledWorlds(_WithoutState):
         rewards = np.zeros(len(self._worlds), np.float32)
         for index, world in enumerate(self._worlds):
             ends, told = (terminated[index], truncated[index]), self._told(shown, info, index)
-            self._rows[index], rewards[index], *_ = world.step(_row(shown, index), reward[index], *ends, told)
+            self._rows[index], rewards[index], *_ = world.step(self._shown(shown, index), reward[index], *ends, told)
         return Outcome(_stacked(self._rows), rewards, terminated, truncated & ~terminated)
+
+    def _shown(self, batch: Any, index: int) -> Any:
+        """What one world shows."""
+        return _row(batch, index, self._space)
 
     def _told(self, shown: Any, info: Mapping[str, Any], index: int) -> dict[str, Any]:
         """One world's ``info``, with the mask of its actions where agents look for it."""
@@ -219,7 +230,7 @@ class PooledWorlds(_WithoutState):
         return {**told, keys.ACTION_MASK: part[self._mask.name][index]}
 
 
-def _row(batch: Any, index: int, space: gymnasium.Space | None = None) -> Any:
+def _row(batch: Any, index: int, space: gymnasium.Space | None) -> Any:
     """One world's part of observations; a tuple holds worlds unless the ``space`` of one world is a ``Tuple``."""
     if isinstance(batch, Mapping):
         of = space.spaces if isinstance(space, spaces.Dict) else {}
