@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from hdrqn_torchrl.analysis.intervals import CONFIDENCE, center_interval
 from hdrqn_torchrl.analysis.results import Array, References, Run, asks_for_a_time, curve, final_value, is_share
+from hdrqn_torchrl.runs.persistence.files import replaced
 
 Center = Literal["mean", "iqm"]
 _CUT = {"mean": 0.0, "iqm": 0.25}
@@ -206,7 +207,7 @@ def write_table(path: Path, tasks: Iterable[TaskResults], *, axis: str) -> None:
         tasks: results; positions without an estimate are left out.
         axis: what ``x`` counts.
     """
-    with path.open("w", newline="") as file:
+    with replaced(path) as unfinished, unfinished.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(("task", "group", "metric", "axis", "x", "estimate", "low", "high", "seeds"))
         for task in tasks:

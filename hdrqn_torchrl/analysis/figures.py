@@ -14,6 +14,7 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
 from hdrqn_torchrl.analysis.results import Run
+from hdrqn_torchrl.analysis.saving import save_figure
 
 
 def plot_legs(
@@ -32,7 +33,7 @@ def plot_legs(
     image = _draw_legs(axis, rates, [f"\n({number})" for number in options.flat], names)
     axis.set(xlabel="to", ylabel="from")
     figure.colorbar(image, label="reached")
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 def plot_legs_over_time(run: Run, names: Sequence[str], path: Path, *, windows: int = 6) -> None:
@@ -65,7 +66,7 @@ def plot_legs_over_time(run: Run, names: Sequence[str], path: Path, *, windows: 
     figure.supxlabel("to", fontsize=9)
     figure.supylabel("from", fontsize=9)
     figure.colorbar(image, ax=axes, label="reached, mean over log points")
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path, dpi=150)
 
 
 def _draw_legs(axis: Axes, rates: NDArray[np.floating[Any]], notes: Sequence[str], names: Sequence[str]) -> AxesImage:
@@ -98,4 +99,4 @@ def plot_places(counts: NDArray[np.integer[Any]], screen: NDArray[np.uint8], pat
     image = axis.imshow(seen, extent=extent, aspect=0.75 * width / height, cmap="inferno", norm=LogNorm(), alpha=0.85)
     axis.set_axis_off()
     figure.colorbar(image, label="steps")
-    figure.savefig(path, dpi=150)
+    save_figure(figure, path, dpi=150)

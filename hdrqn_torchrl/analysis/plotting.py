@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from hdrqn_torchrl.analysis.results import Metrics, References, read_metrics
+from hdrqn_torchrl.analysis.saving import save_figure
 
 __all__ = ["plot_run", "read_metrics"]
 
@@ -52,7 +53,7 @@ def plot_run(
     if axes[0].get_legend_handles_labels()[0]:
         axes[0].legend(loc="lower right")
     figure.suptitle(title.replace("$", r"\$"))  # it names what a run was composed from
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)
 
 
 def _reference_lines(axis: Axes, references: References, name: str) -> None:

@@ -18,6 +18,7 @@ from yaml import YAMLError
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 from hdrqn_torchrl.runs.settings.commands import as_called
+from hdrqn_torchrl.runs.settings.seeds import LARGEST_SEED
 
 
 def check_place(path: Path, key: str) -> None:
@@ -96,13 +97,20 @@ def command_line(schema: type, doc: str, run: Callable[[Any], None]) -> None:
             raise SettingsError(f"{str(error).splitlines()[0]}; the settings are {known}.") from error
         if missing := OmegaConf.missing_keys(settings):
             raise SettingsError(f"{min(missing)} must be given: {min(missing)}=...; --help shows all settings.")
-        run(replace(OmegaConf.to_object(settings), **texts))  # type: ignore[type-var]
+        given = replace(OmegaConf.to_object(settings), **texts)  # type: ignore[type-var]
+        _check_seed(getattr(given, "seed", None))
+        run(given)
         sys.stdout.flush()
     except SettingsError as error:
         sys.exit(f"error: {error}")
     except BrokenPipeError:  # whoever reads the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python would fail again as it ends
         sys.exit(1)
+
+
+def _check_seed(seed: int | None) -> None:
+    if seed is not None and not 0 <= seed <= LARGEST_SEED:
+        raise SettingsError(f"seed must lie in [0, {LARGEST_SEED:,}], got {seed}; leave it out for the default.")
 
 
 def _is_text(schema: type, key: str, value: str) -> bool:

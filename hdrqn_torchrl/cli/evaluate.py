@@ -37,6 +37,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import MISSING
 
 from hdrqn_torchrl.cli.command_line import check_place, command_line, results_alone
+from hdrqn_torchrl.runs.persistence.files import write_whole
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 if TYPE_CHECKING:
@@ -71,10 +72,6 @@ def run(settings: Settings) -> None:
     for name, least in (("episodes", 1), ("num_envs", 1), ("threads", 1)):
         if getattr(settings, name) < least:
             raise SettingsError(f"{name} must be >= {least}, got {getattr(settings, name)}.")
-    if settings.seed is not None and settings.seed < 0:
-        raise SettingsError(
-            f"seed must be >= 0, got {settings.seed}; leave it out for the seed of the run's own summary."
-        )
     if not 0.0 <= settings.epsilon <= 1.0:
         raise SettingsError(f"epsilon must lie in [0, 1], got {settings.epsilon}; 0 is greedy.")
     if settings.out is not None:
@@ -87,7 +84,7 @@ def run(settings: Settings) -> None:
     print(result, flush=True)  # first: no later error can lose it
     try:
         if settings.out is not None:
-            Path(settings.out).write_text(result + "\n")
+            write_whole(Path(settings.out), result + "\n")
         if settings.figures is not None:
             draw(observers, agent, Path(settings.figures))
     except (OSError, ValueError) as error:
@@ -136,6 +133,7 @@ def evaluate_run(settings: Settings) -> tuple[dict[str, Any], Agent, dict[str, A
     result = {
         "run": settings.run,
         "checkpoint": settings.checkpoint,
+        "frames": agent.frames,
         "env": agent.config.env,
         "seed": seed,
         "epsilon": settings.epsilon,

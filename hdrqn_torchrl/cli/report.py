@@ -81,7 +81,13 @@ def run(settings: Settings) -> None:
     if settings.keep:
         check_archive(settings.keep, patterns)
     out = Path(settings.out)
-    out.with_suffix("").mkdir(parents=True, exist_ok=True)
+    figures = out.with_suffix("")
+    try:
+        figures.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SettingsError(
+            f"out must be a page beside which its figures can lie in a folder {figures}, got {settings.out!r} ({error})."
+        ) from error
     left: list[str] = []
     parts: dict[str, str] = {}
     overview = [CLAIMS.replace("|", "| study |", 1).replace("|---", "|---|---", 1)]
@@ -276,7 +282,8 @@ def screen_rows(label: str, members: list[Found]) -> list[str]:
             interval = result["intervals"]["return_mean"]
             reach = f"{interval[0]:.0f} to {interval[1]:.0f}" if interval and interval[0] < interval[1] else ""
             checkpoint = Path(result.get("checkpoint", "last")).name
-            frames = f"{run.metrics['frames'][-1] / 1000:.0f}k{'' if checkpoint == 'last' else f', {checkpoint}'}"
+            trained = result.get("frames") or run.metrics["frames"][-1]  # files of weights alone do not say
+            frames = f"{trained / 1000:.0f}k{'' if checkpoint == 'last' else f', {checkpoint}'}"
             cells = (
                 *(label, value_of(member.entry, "seed"), frames),
                 *(f"{result['epsilon']:g}", f"{result['env']['sticky']:g}"),

@@ -29,6 +29,8 @@ class Agent:
     env: EnvBase
     """Transformed environment with batch size ``[num_envs]``."""
     algorithm: Algorithm
+    frames: int | None = None
+    """Environment frames that its weights were trained for; ``None``: weights without a checkpoint, which do not say."""
 
 
 def load_agent(
@@ -69,13 +71,13 @@ def load_agent(
     config = replace(own, env=own.env | changes)
     env, algorithm = build_algorithm(config, {"num_envs": num_envs, "device": "cpu"}, allowed_targets)
     try:
-        load_policy(algorithm.policy, folder / layout.CHECKPOINTS, checkpoint)
+        frames = load_policy(algorithm.policy, folder / layout.CHECKPOINTS, checkpoint)
     except ValueError as error:
         if changes:
             refuse_other_interface(build_env(own, {"num_envs": 1, "device": "cpu"}, allowed_targets), env, changes)
         raise SettingsError(str(error)) from error
     warn_of_other_names(folder, env)
-    return Agent(config, algorithm.transform(env), algorithm)
+    return Agent(config, algorithm.transform(env), algorithm, frames)
 
 
 def refuse_other_interface(env: EnvBase, changed: EnvBase, changes: Mapping[str, Any]) -> None:

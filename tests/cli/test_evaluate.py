@@ -33,7 +33,7 @@ def test_the_last_checkpoint_scores_as_in_the_final_evaluation_of_its_run(run, c
     """The last checkpoint, played in the same worlds as the run's final evaluation."""
     result = call("checkpoint=last", "episodes=8", "num_envs=8")
     summary = json.loads((run / "summary.json").read_text())
-    for name in ("return_mean", "intrinsic_mean", "success_rate", "steps_mean", "episodes", "ceiling"):
+    for name in ("return_mean", "intrinsic_mean", "success_rate", "steps_mean", "episodes", "frames", "ceiling"):
         assert result[name] == summary[name], name
     assert result["seed"] == 1_000_001  # not the 1_000_000 of the evaluations that chose the best checkpoint
 
@@ -84,7 +84,8 @@ def test_the_object_can_be_written_to_a_file(call, tmp_path):
     [
         (["episodes=0"], "episodes must be >= 1, got 0"),
         (["num_envs=0"], "num_envs must be >= 1, got 0"),
-        (["seed=-1"], "seed must be >= 0, got -1"),
+        (["seed=-1"], "seed must lie in \\[0, 1,000,000,000,000,000,000\\], got -1; leave it out"),
+        (["seed=18446744073709551616"], "seed must lie in"),
         (["epsilon=2"], r"epsilon must lie in \[0, 1\], got 2"),
         (["episods=3"], "episods"),
         (["env.veiw=3"], r"env.KEY must be one of .*, got veiw"),

@@ -295,7 +295,7 @@ class TestScreen:
             env = {"subgoals": ["left_door", "key"], "sticky": sticky}
             result = {"env": env, "epsilon": epsilon, "episodes": 100, "per_subgoal": subgoals, "return_mean": 310.2}
             result |= {"intervals": {"return_mean": [290.4, 330.0]}, "success_rate": 0.75, "steps_mean": 190.0}
-            result |= {"checkpoint": checkpoint}
+            result |= {"checkpoint": checkpoint, **({"frames": 2_000} if checkpoint == "best" else {})}
             (folder / f"evaluations/{name}.json").write_text(json.dumps(result))
         return folder
 
@@ -305,7 +305,7 @@ class TestScreen:
         rows = [line for line in text.splitlines() if line.startswith("| v3")]
         assert rows == [
             "| v3 | 0 | 0k | 0 | 0 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
-            "| v3 | 0 | 0k, best | 0.05 | 0.25 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
+            "| v3 | 0 | 2k, best | 0.05 | 0.25 | 310 | 290 to 330 | 85% | 75% | 190 | 100 | 0123456 |",
         ]
         for name in ("montezuma", "montezuma_right", "montezuma_left", "montezuma_legs_v3"):
             assert f"(results/{name}.png)" in text and (Path("results") / f"{name}.png").stat().st_size > 100
@@ -328,6 +328,7 @@ def test_runs_of_another_size_do_not_count(run, outputs):
         (["size=huge"], "error: size must be one of small, paper, got 'huge'."),
         (["studies=gridword"], "error: studies must be some of .*, got 'gridword'."),
         (["out=results.txt"], "error: out must end in .md, got 'results.txt'; "),
+        (["out=/dev/null.md"], "error: out must be a page beside which its figures can lie in a folder /dev/null, got "),
         (["keep=runs.zip"], "error: keep must end in .tar.xz, got 'runs.zip'; for example keep=runs.tar.xz."),
         (["runs=broken.tar.xz"], "error: runs must name folders or readable archives, got broken.tar.xz: "),
     ],

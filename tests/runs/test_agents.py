@@ -57,12 +57,15 @@ class TestLoadAgent:
 
     @pytest.mark.parametrize(("checkpoint", "step"), [("best", 100), ("last", 200)])
     def test_an_agent_has_the_best_or_the_last_weights(self, run, checkpoint, step):
-        assert step_of(load_agent(run, checkpoint=checkpoint)) == step
+        agent = load_agent(run, checkpoint=checkpoint)
+        assert step_of(agent) == agent.frames == step
 
     def test_an_agent_has_the_weights_of_a_path(self, run):
         assert step_of(load_agent(run)) == 100
-        assert step_of(load_agent(str(run), checkpoint=str(run / "checkpoints" / "checkpoint-000000000200"))) == 200
-        assert step_of(load_agent(run, checkpoint=str(run / "weights.safetensors"))) == 200
+        agent = load_agent(str(run), checkpoint=str(run / "checkpoints" / "checkpoint-000000000200"))
+        assert step_of(agent) == agent.frames == 200
+        agent = load_agent(run, checkpoint=str(run / "weights.safetensors"))
+        assert step_of(agent) == 200 and agent.frames is None
 
     def test_the_task_of_an_agent_can_be_changed(self, run):
         agent = load_agent(run, env_changes={"layout": "four_rooms", "max_steps": 3})

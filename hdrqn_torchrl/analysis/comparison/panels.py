@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from hdrqn_torchrl.analysis.estimates import Center, Estimate, Group, TaskResults
 from hdrqn_torchrl.analysis.results import Array, is_share
+from hdrqn_torchrl.analysis.saving import save_figure
 
 
 class Panel(NamedTuple):
@@ -248,4 +249,4 @@ def save(figure: Figure, paths: Iterable[Path]) -> None:
     with matplotlib.rc_context(_STYLE):
         for path in paths:
             undated = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-            figure.savefig(path, metadata=undated.get(path.suffix.lower()))
+            save_figure(figure, path, metadata=undated.get(path.suffix.lower()))

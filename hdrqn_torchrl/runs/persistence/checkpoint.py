@@ -131,7 +131,7 @@ class Checkpoints:
         scores = {path: score for path in self._paths() if (score := _score(path)) is not None}  # the newest first
         kept = {
             *list(scores)[: self._keep_last],
-            max(scores, key=lambda path: (scores[path], _step(path)), default=None),
+            max(scores, key=lambda path: (scores[path], step_of(path)), default=None),
         }
         for path in scores.keys() - kept:
             remove_all(path.rename(path.with_name(f".{path.name}.delete")))
@@ -192,7 +192,7 @@ class Checkpoints:
 
     def go_back_to(self, step: int) -> None:
         """Removes later checkpoints, as their steps will be done again, and damaged ones, which would count as kept."""
-        kept = {path for path in self._whole() if _step(path) <= step}
+        kept = {path for path in self._whole() if step_of(path) <= step}
         for path in self._paths():
             if path not in kept:
                 remove_all(path.rename(path.with_name(f".{path.name}.delete")))
@@ -200,12 +200,12 @@ class Checkpoints:
     def _paths(self) -> list[Path]:
         """Folders named like checkpoints, the newest first."""
         self._check_place()
-        folders = [path for path in self.directory.glob(f"{PREFIX}[0-9]*") if path.is_dir() and _step(path) >= 0]
+        folders = [path for path in self.directory.glob(f"{PREFIX}[0-9]*") if path.is_dir() and step_of(path) >= 0]
         if links := [path for path in folders if path.is_symlink()]:
             raise CheckpointError(
                 f"{links[0]} must be a checkpoint, got a symbolic link; nothing in a run folder is followed."
             )
-        return sorted(folders, key=_step, reverse=True)
+        return sorted(folders, key=step_of, reverse=True)
 
     def _whole(self) -> Iterator[Path]:
         """Undamaged checkpoints, the newest first."""
@@ -234,8 +234,13 @@ def _in_a_line(error: Exception) -> str:
     return text if len(text) <= _LONGEST_REASON else f"{text[:_LONGEST_REASON]}..."
 
 
-def _step(path: Path) -> int:
-    """The step in a checkpoint's name; -1 for other names."""
+def step_of(path: Path) -> int:
+    """The step in a checkpoint's name; -1 for other names.
+
+    Examples:
+        >>> step_of(Path("checkpoints/checkpoint-000000150016"))
+        150016
+    """
     number = path.name.removeprefix(PREFIX)
     return int(number) if number.isdecimal() else -1
 

@@ -11,19 +11,22 @@ from torch import Tensor, nn
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.runs.persistence import layout
-from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
+from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints, step_of
 from hdrqn_torchrl.runs.persistence.durable import sync
 from hdrqn_torchrl.runs.persistence.files import replaced
 from hdrqn_torchrl.runs.persistence.serialization import check_tensors
 
 
-def load_policy(policy: nn.Module, directory: str | Path, which: str = "best") -> None:
+def load_policy(policy: nn.Module, directory: str | Path, which: str = "best") -> int | None:
     """Loads a policy's weights from a run.
 
     Args:
         policy: built with the settings of the run.
         directory: the run's folder of checkpoints; if it is not there, the run's weights beside it are loaded.
         which: ``"best"``, ``"last"``, or the path of a checkpoint or of a file of :func:`save_weights`.
+
+    Returns:
+        Environment frames that the weights were trained for; ``None`` for a file of weights alone, which does not say.
 
     Raises:
         ValueError: if there is none, it is damaged, or it does not fit.
@@ -40,7 +43,7 @@ def load_policy(policy: nn.Module, directory: str | Path, which: str = "best") -
     alone = directory.with_name(layout.WEIGHTS)
     if which in ("best", "last") and not directory.exists() and alone.is_file():
         load_weights(policy, alone)
-        return
+        return None
     checkpoints = Checkpoints(directory)
     try:
         path = {"best": checkpoints.best, "last": checkpoints.newest}.get(which, lambda: Path(which))()
@@ -48,8 +51,9 @@ def load_policy(policy: nn.Module, directory: str | Path, which: str = "best") -
             raise ValueError(f"checkpoint={which} is not in {directory}: the run has not saved anything yet.")
         if path.is_file():
             load_weights(policy, path)
-        else:
-            checkpoints.load({"policy": policy}, path)
+            return None
+        checkpoints.load({"policy": policy}, path)
+        return step if (step := step_of(path)) >= 0 else None
     except CheckpointError as error:
         raise ValueError(f"checkpoint can't be loaded: {error}") from error
 

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any, get_type_hints
 
 from hdrqn_torchrl.runs.settings.arguments import Settings, SettingsError, fits, in_words, remedy, shown
-from hdrqn_torchrl.runs.settings.seeds import check_together
+from hdrqn_torchrl.runs.settings.seeds import LARGEST_SEED, check_together
 from hdrqn_torchrl.runs.settings.trust import check_targets
 
 
@@ -101,12 +101,12 @@ _LIMITS = (
     ("steps_per_batch", 2, 100_000),  # TorchRL's two-dimensional storage can't take single steps
     ("log_frames", 1, 10**15),
     ("batch_scale", 1, 10_000),
-    ("seed", 0, 10**18),
+    ("seed", 0, LARGEST_SEED),
     ("evaluation.num_envs", 1, 100_000),
     ("evaluation.episodes", 1, 10**9),
     ("evaluation.interval_frames", 1, 10**15),
     ("evaluation.final_episodes", 1, 10**9),
-    ("evaluation.seed", 0, 10**18),
+    ("evaluation.seed", 0, LARGEST_SEED),
     ("checkpoint.interval_frames", 1, 10**15),
     ("collector.workers", 1, 10_000),
     ("checkpoint.keep_last", 2, 1_000),  # so that there is one while the newest is being replaced

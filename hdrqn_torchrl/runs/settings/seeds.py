@@ -7,6 +7,7 @@ from typing import Any
 
 from hdrqn_torchrl.runs.settings.arguments import TARGET, SettingsError, shown
 
+LARGEST_SEED = 10**18
 _MOST = 10_000
 _ONE_AT_A_TIME = ("make_wandb_logger", "make_mlflow_logger")
 """Their services keep one run for a process."""
