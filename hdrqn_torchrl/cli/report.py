@@ -86,7 +86,7 @@ def run(settings: Settings) -> None:
         figures.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise SettingsError(
-            f"out must be a page beside which its figures can lie in a folder {figures}, got {settings.out!r} ({error})."
+            f"out must be a page whose figures can lie in a folder {figures}, got {settings.out!r} ({error})."
         ) from error
     left: list[str] = []
     parts: dict[str, str] = {}

@@ -12,6 +12,8 @@ from hdrqn_torchrl.learning.precision import Precision
 from hdrqn_torchrl.modules.sizes import check_size
 from hdrqn_torchrl.objectives import check_returns, target_lookahead
 
+_LARGEST_SCALE = 10_000
+
 
 @dataclass(frozen=True, kw_only=True)
 class LearnerSettings:
@@ -108,7 +110,7 @@ class LearnerSettings:
         rules = (
             ("slice_len", slice_len >= 1, ">= 1", "use 1 for a feed-forward network"),
             ("batch_size", self.batch_size >= 1, ">= 1", "use 32"),
-            ("batch_scale", self.batch_scale >= 1, ">= 1", "use 1"),
+            ("batch_scale", 1 <= self.batch_scale <= _LARGEST_SCALE, f"in [1, {_LARGEST_SCALE:,}]", "use 1"),
             ("capacity", self.capacity >= slice_len, ">= slice_len", "use 100000 for steps, 50000 for options"),
             ("frames_per_update", self.frames_per_update > 0, "> 0", "use 8"),
             ("warmup_frames", self.warmup_frames >= 0, ">= 0", "use 5000"),

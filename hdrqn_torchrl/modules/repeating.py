@@ -23,7 +23,7 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         start, end, anneal_frames, ladder: as in :class:`EpsilonGreedy`; epsilon is the share of random steps, not of
             steps at which a random stretch starts (a little more than that, where options cut stretches short).
         exponent: :math:`\mu`.
-        max_repeats: longest stretch.
+        max_repeats: longest stretch, 100,000 at most.
 
     Raises:
         ValueError: if an argument breaks its rule.
@@ -50,7 +50,7 @@ class RepeatingEpsilonGreedy(EpsilonGreedy):
         super().__init__(start, end, anneal_frames=anneal_frames, ladder=ladder)
         if not 0.0 < exponent < float("inf"):
             raise ValueError(f"exponent must be > 0 and finite, got {exponent}; Dabney et al. use 2.")
-        check_size("max_repeats", max_repeats, 15)
+        check_size("max_repeats", max_repeats, 15, most=100_000)
         durations = torch.arange(1, max_repeats + 1, dtype=torch.float32) ** -exponent
         self.register_buffer("_durations", durations / durations.sum(), persistent=False)
         self.carried_spec = Unbounded(shape=(2,), dtype=torch.int64)

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 from numbers import Integral
 
 
-def check_size(name: str, size: int, usual: int | str, *, least: int = 1) -> None:
-    """Refuses a size that is too small or not a whole number.
+def check_size(name: str, size: int, usual: int | str, *, least: int = 1, most: int | None = None) -> None:
+    """Refuses a size that is too small, too large or not a whole number.
 
     Args:
         name: name of the argument, for the message.
         size: its value.
         usual: a value that works, for the message.
         least: the smallest valid size.
+        most: the largest, if there is one.
 
     Raises:
         ValueError: if the size is not valid.
@@ -28,6 +29,8 @@ def check_size(name: str, size: int, usual: int | str, *, least: int = 1) -> Non
         raise ValueError(f"{name} must be a whole number >= {least}, got {size!r}; use {usual}.")
     if size < least:
         raise ValueError(f"{name} must be >= {least}, got {size}; use {usual}.")
+    if most is not None and size > most:
+        raise ValueError(f"{name} must be <= {most:,}, got {size}; use {usual}.")
 
 
 def check_memory_span(steps: int) -> None:

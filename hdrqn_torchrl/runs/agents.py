@@ -30,7 +30,7 @@ class Agent:
     """Transformed environment with batch size ``[num_envs]``."""
     algorithm: Algorithm
     frames: int | None = None
-    """Environment frames that its weights were trained for; ``None``: weights without a checkpoint, which do not say."""
+    """Environment frames that its weights were trained for; ``None``: weights without a checkpoint do not say."""
 
 
 def load_agent(

@@ -328,7 +328,10 @@ def test_runs_of_another_size_do_not_count(run, outputs):
         (["size=huge"], "error: size must be one of small, paper, got 'huge'."),
         (["studies=gridword"], "error: studies must be some of .*, got 'gridword'."),
         (["out=results.txt"], "error: out must end in .md, got 'results.txt'; "),
-        (["out=/dev/null.md"], "error: out must be a page beside which its figures can lie in a folder /dev/null, got "),
+        (
+            ["out=/dev/null.md"],
+            "error: out must be a page whose figures can lie in a folder /dev/null, got ",
+        ),
         (["keep=runs.zip"], "error: keep must end in .tar.xz, got 'runs.zip'; for example keep=runs.tar.xz."),
         (["runs=broken.tar.xz"], "error: runs must name folders or readable archives, got broken.tar.xz: "),
     ],

@@ -43,8 +43,12 @@ def test_a_scale_keeps_the_pace_in_frames_of_replay_and_target_network():
     assert (scaled.learning_rate, scaled.learning_rate_end) == (2 * settings.learning_rate, None)
     assert replace(settings, learning_rate_end=1e-4).scaled().learning_rate_end == pytest.approx(2e-4)
     assert scaled.scaled() == scaled
-    with pytest.raises(ValueError, match="batch_scale must be >= 1, got 0; use 1"):
-        LearnerSettings(batch_scale=0)
+
+
+@pytest.mark.parametrize("scale", [0, 10_001])
+def test_a_scale_out_of_range_is_refused(scale):
+    with pytest.raises(ValueError, match=rf"batch_scale must be in \[1, 10,000\], got {scale}; use 1"):
+        LearnerSettings(batch_scale=scale)
 
 
 def test_minibatches_of_a_learner_are_larger():

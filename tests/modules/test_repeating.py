@@ -116,6 +116,7 @@ class TestRepeatingEpsilonGreedy:
             ({"start": 2.0}, r"start must be an epsilon in \[0, 1\], got 2.0; "),
             ({"exponent": 0.0}, "exponent must be > 0 and finite, got 0.0; "),
             ({"max_repeats": 0}, "max_repeats must be >= 1, got 0; "),
+            ({"max_repeats": 10**11}, "max_repeats must be <= 100,000, got 100000000000; use 15"),
         ],
     )
     def test_values_out_of_range_are_refused(self, arguments, message):
