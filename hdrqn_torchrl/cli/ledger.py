@@ -40,7 +40,7 @@ def write_note(ledger: Path, hydra: HydraConf, state: str, folder: Path | None =
         folder = Path(known[0]) if known else Path(hydra.sweep.dir, hydra.sweep.subdir)
     note = {
         "job": job,
-        "folder": os.path.relpath(Path(cwd, folder), cwd),
+        "folder": as_told(Path(cwd, folder), Path(cwd)),
         "overrides": list(hydra.overrides.task),
         "state": state,
     }
@@ -49,6 +49,17 @@ def write_note(ledger: Path, hydra: HydraConf, state: str, folder: Path | None =
         torn = file.read() not in (b"", b"\n")  # by a full disk, or a process that was killed
         file.write(b"\n" * torn + json.dumps(note).encode() + b"\n")  # in one piece: other processes write here, too
         file.flush()
+
+
+def as_told(folder: Path, cwd: Path) -> str:
+    """A folder as its reader names it: from the working directory if it is below it.
+
+    Examples:
+        >>> as_told(Path("/project/outputs/a"), Path("/project")), as_told(Path("/data/a"), Path("/project"))
+        ('outputs/a', '/data/a')
+    """
+    whole = Path(os.path.normpath(folder))
+    return str(whole.relative_to(cwd) if whole.is_relative_to(cwd) else whole)
 
 
 def ledger_of(hydra: HydraConf) -> Path:
