@@ -128,20 +128,20 @@ def command(folder: Path, allowed_targets: Sequence[str] = ()) -> str:
         value = os.path.relpath(folder)
     if value == "auto":
         value = "./auto"
-    if not _is_read_as_it_stands(value):
-        value = '"' + value.replace('"', '\\"') + '"'
-    words = [f"resume={value}"]
+    words = [f"resume={_quoted(value)}"]
     if allowed_targets:
-        words.append(f"allowed_targets=[{','.join(allowed_targets)}]")
+        words.append(f"allowed_targets=[{','.join(map(_quoted, allowed_targets))}]")
     return f"{command_of('train')} {shlex.join(words)}"
 
 
-def _is_read_as_it_stands(value: str) -> bool:
-    """Whether Hydra reads a value as plain text, unlike ``null``, ``007`` or ``a,b``."""
+def _quoted(value: str) -> str:
+    """A value as Hydra reads it as plain text: in quotes if it is one like ``null``, ``007`` or ``a,b``."""
     try:
-        return OverridesParser.create().parse_override(f"resume={value}").value() == value
+        if OverridesParser.create().parse_override(f"resume={value}").value() == value:
+            return value
     except HydraException:
-        return False
+        pass
+    return '"' + value.replace('"', '\\"') + '"'
 
 
 def find_same(config: RunSettings, folder: Path) -> Path | None:
@@ -192,9 +192,10 @@ def refuse_other_databases(config: RunSettings, known: Set[str]) -> None:
     for index, logger in enumerate(config.logger["loggers"]):
         place = logger.get("tracking_uri")
         if place is not None and place not in {*known, *config.allowed_targets}:
+            allowed = shlex.quote(f"allowed_targets=[{_quoted(str(place))}]")
             raise SettingsError(
                 f"logger.loggers[{index}].tracking_uri must be one of {', '.join(sorted(known))}, got {place!r}, which "
-                f"stands in the run folder. If it is yours, add 'allowed_targets=[{place}]' to the command."
+                f"stands in the run folder. If it is yours, add {allowed} to the command."
             )
 
 

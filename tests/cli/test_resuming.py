@@ -86,10 +86,10 @@ class TestANewRun:
         ["run", "a b", "a#b", "a=b,c", "(a) [b]", "jörg's", 'a"b', "~a", "@a%b", "null", "true", "1e3", "007"],
     )
     def test_the_command_to_resume_can_be_typed_as_it_is_printed(self, name):
-        words = shlex.split(command(Path(name), ["mine.Env", "mine.network"]))
+        words = shlex.split(command(Path(name), ["mine.Env", "http://here?x=y,z"]))
         resume, allowed = OverridesParser.create().parse_overrides(words[2:])
         assert words[:2] == ["python", "train.py"]
-        assert str(resume.value()) == name and allowed.value() == ["mine.Env", "mine.network"]
+        assert str(resume.value()) == name and allowed.value() == ["mine.Env", "http://here?x=y,z"]
 
     def test_a_folder_called_auto_is_not_taken_for_the_newest_run(self):
         assert command(Path("auto")) == "python train.py resume=./auto"
@@ -309,12 +309,13 @@ class TestDatabases:
         file.write_text(file.read_text().replace("sqlite:///outputs/mlflow.db", place))
         return run
 
-    @pytest.mark.parametrize("place", ["http://elsewhere:5000", "sqlite:////home/mine.db", "sqlite:///../mlflow.db"])
+    @pytest.mark.parametrize("place", ["http://elsewhere:5000", "sqlite:////home/mine.db?x=y,z", "sqlite:///../mlflow.db"])
     def test_a_database_that_the_command_does_not_name_is_refused(self, place):
         run = self.named(place)
-        with pytest.raises(SettingsError, match=re.escape(f"got {place!r}, which stands in the run folder")):
+        with pytest.raises(SettingsError, match=re.escape(f"got {place!r}, which stands in the run folder")) as refusal:
             plan_for(f"resume={run}")
-        assert plan_for(f"resume={run}", f"allowed_targets=['{place}']").resumed
+        (remedy,) = re.findall(r"If it is yours, add (.*) to the command", str(refusal.value))
+        assert plan_for(f"resume={run}", *shlex.split(remedy)).resumed
 
     def test_the_default_database_is_accepted(self):
         assert plan_for(f"resume={self.named('sqlite:///outputs/mlflow.db')}").resumed
