@@ -196,7 +196,7 @@ class ChangeDetector(nn.Module):
         return torch.where(still, self.num_actions, action), torch.where(still[..., None, None], old, moved)
 
     def _put_changes(self, tokens: Tensor, old: Tensor, action: Tensor, new: Tensor) -> None:
-        """Writes the tokens of the most reliable places ``[*, K]``."""
+        """Writes tokens ``[*, K]`` of the places nearest to the agent, of as near ones the most reliable."""
         which, copied = self._explain(old, action, new)
         usual = self.usual[which]
         filled = self.filled[which].unsqueeze(-1)

@@ -32,14 +32,14 @@ class History(NamedTuple):
 
 
 def events_of(history: History, precedence: Tensor, *, least: int, absorbed: float = 0.9) -> list[int]:
-    """Tokens that are events of their own, the most reliable ones first.
+    """Tokens that are events of their own, in the order of precedence: those nearest to the agent first.
 
-    A token that comes with events of more reliable places is theirs: the colour of a key that is picked up, or what is
-    seen once a door is open.
+    A token that comes with events of places that precede its own is theirs: the colour of a key that is picked up, or
+    what is seen once a door is open.
 
     Args:
         history: of all steps.
-        precedence: by token; lower ones are more reliable.
+        precedence: by token; lower ones are nearer to the agent or, of as near ones, more reliable.
         least: number of times that an event has to be seen.
         absorbed: share of a token's steps that have such an event.
     """

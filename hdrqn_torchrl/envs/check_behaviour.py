@@ -90,7 +90,7 @@ def _paid(rollout: Rollout) -> Iterator[Finding]:
     cut = _column(rollout, keys.TRUNCATED) & ~_column(rollout, keys.TERMINATED)
     paid = _column(rollout, keys.REWARD).abs()
     if (paid[cut] > 0).sum() > 1 and paid[cut].sum() > paid[~cut].sum():
-        text = "most of the reward is paid in steps that are 'truncated', of which agents learn nothing"
+        text = "most of the reward is paid in steps that are 'truncated', of which v3 and sub levels learn nothing"
         yield wrong(text, "it is not learned; end episodes by 'terminated' where their task ends")
 
 

@@ -7,11 +7,11 @@ top level pursues the task. For every level, every c and every choice x that agr
 
 - reward :math:`r_l(c)`: at the top the task's extrinsic reward; below, the critic's reward for c
   (:class:`~hdrqn_torchrl.transforms.SubgoalTransform`, rule 3);
-- end :math:`e_l(c)`: the episode terminated or, below the top, c was attained;
-- :math:`U = \max_{x'} Q_l(s', c, x')` (Double, over what can be chosen) if x was attained in this step, which always
-  holds for an action; else :math:`Q_l(s', c, x)`, as the option goes on;
+- end :math:`e_l(c)`: the episode terminated or, below the top, c was attained or lost (it can't be chosen any more);
+- :math:`U = \max_{x'} Q_l(s', c, x')` (Double, over what can be chosen) if x was attained or lost in this step, which
+  always holds for an action; else :math:`Q_l(s', c, x)`, as the option goes on;
 - :math:`\lambda_t` is lambda if the next step agrees with x, else 0 (Watkins' cut); a subgoal's trace ends where it
-  is attained;
+  is attained or lost;
 - an action agrees with a step if it was taken; a subgoal x agrees if the greedy choice of the level below for x does.
   x learns from the steps that it agrees with (intra-option learning; Sutton, Precup and Singh, 1998), and from those in
   which it was pursued.
@@ -73,7 +73,7 @@ class AllSubgoalsLoss(SequenceLoss):
         all_subgoals: ``False``: each level learns only about the subgoal that was pursued.
         intra_option: ``False``: levels that choose subgoals learn only from the first steps of options, and only of
             options that end within the sequence. (With ``True``, options are assumed to last until their subgoal is
-            attained; a step limit of options is ignored.)
+            attained or lost; a step limit of options is ignored.)
         max_meta_target, min_meta_target: largest and smallest possible return of the task, if known; the top level's
             targets are clipped to this range.
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;
@@ -149,7 +149,7 @@ class AllSubgoalsLoss(SequenceLoss):
         rates = {"sub_gamma": sub_gamma, "meta_gamma": meta_gamma, "middle_gamma": middle_gamma}
         for name, value in {**rates, "trace_decay": trace_decay}.items():
             if not 0.0 <= value <= 1.0:
-                raise ValueError(f"{name} must lie in [0, 1], got {value}; the defaults are 0.95, 0.97 and 0.8.")
+                raise ValueError(f"{name} must lie in [0, 1], got {value}; make_v3 has 0.9, 0.95 and 0.8.")
         check_bounds(min_meta_target, max_meta_target, names=("min_meta_target", "max_meta_target"))
         if lookahead < 1:
             raise ValueError(f"lookahead must be >= 1 step, got {lookahead}; the last step is never trained.")

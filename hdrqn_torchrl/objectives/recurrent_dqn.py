@@ -49,9 +49,9 @@ class RecurrentDQNLoss(SequenceLoss):
 
     Steps that enter the loss: :func:`~hdrqn_torchrl.objectives.training_mask`, and of these all whose target is in the
     sequence. That of a terminated step always is. Otherwise it is not if the step is the last real one, if an episode
-    is truncated there, or if an option ends there without being terminated (its time limit; a subgoal that is gone):
-    the next step then pursues another subgoal, with a fresh memory, and says nothing about the value of
-    going on. In the second form the target of the last step is there in any case.
+    is truncated there, or if an option ends there without being terminated (its time limit; a subgoal that could not
+    be chosen to begin with): the next step then pursues another subgoal, with a fresh memory, and says nothing about
+    the value of going on. In the second form the target of the last step is there in any case.
 
     Padding (``mask``) contributes nothing; even NaN in it reaches no gradient. Longer targets (``trace_decay``,
     ``n_step``) go on as long as the sequence and its segment do; behind that, the value stands in. Steps that are left

@@ -309,7 +309,9 @@ class TestDatabases:
         file.write_text(file.read_text().replace("sqlite:///outputs/mlflow.db", place))
         return run
 
-    @pytest.mark.parametrize("place", ["http://elsewhere:5000", "sqlite:////home/mine.db?x=y,z", "sqlite:///../mlflow.db"])
+    @pytest.mark.parametrize(
+        "place", ["http://elsewhere:5000", "sqlite:////home/mine.db?x=y,z", "sqlite:///../mlflow.db"]
+    )
     def test_a_database_that_the_command_does_not_name_is_refused(self, place):
         run = self.named(place)
         with pytest.raises(SettingsError, match=re.escape(f"got {place!r}, which stands in the run folder")) as refusal:

@@ -63,7 +63,7 @@ class MontezumaEnv(EnvBase):
             without sticky actions) the game is deterministic.
         practice: share of episodes that do not begin at the start but at a subgoal that was attained before, drawn
             among those. (Not in the paper.)
-        practice_steps: steps of all emulators together after which practice ends; ``None``: never.
+        practice_steps: steps of all emulators of this environment together after which practice ends; ``None``: never.
         threads: that step the emulators.
         seed: of no-ops, practice and sticky actions; ``None`` draws one from torch's global generator.
         device: device of all tensors.
