@@ -43,6 +43,7 @@ def make_books(
                 len(subgoals),
                 prefix=subgoals.prefix,
                 upper_done_key=None if above is None else above.option_done,
+                upper_terminated_key=None if above is None else above.option_terminated,
                 gamma=gamma,
                 max_option_steps=max_option_steps if index == 0 else None,
                 hazard_reward=hazard_reward,

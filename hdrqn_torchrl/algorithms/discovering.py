@@ -11,6 +11,7 @@ from hdrqn_torchrl.algorithms.base import Algorithm, copies_of
 from hdrqn_torchrl.algorithms.requirements import Requirements
 from hdrqn_torchrl.discovery import DiscoveredSubgoals, Discovery, DiscoverySettings
 from hdrqn_torchrl.learning import PhaseOne
+from hdrqn_torchrl.modules import SuccessEpsilonGreedy
 
 
 def finds_subgoals(
@@ -68,12 +69,14 @@ def finding_subgoals(algorithm: Algorithm, has: Requirements, settings: Discover
     algorithm.policy.critic = critic  # only now: target networks have none
     before: tuple[Transform, ...] = (DiscoveredSubgoals(critic),)
     *nearer, farthest = algorithm.levels
+    explorations = algorithm.explorations.values()
+    successes = [each.success for each in explorations if isinstance(each, SuccessEpsilonGreedy)]
     return replace(
         algorithm,
         make_transforms=copies_of(*before, *algorithm.make_transforms().transforms),
         levels=(*nearer, replace(farthest, choice_names=critic.names)),
         monitors={
             **algorithm.monitors,
-            "discovery": Discovery(critic, selection, steps, settings, options=options),
+            "discovery": Discovery(critic, selection, steps, settings, options=options, successes=successes),
         },
     )

@@ -111,11 +111,15 @@ class DevicePrioritySampler(Sampler):
         self._powers.scatter_reduce_(0, place, powers, "amax", include_self=False)
         self._largest.copy_(torch.maximum(self._largest, torch.where(there, priority, 0.0).max()))
 
-    def _empty(self) -> None:
+    def forget_priorities(self) -> None:
+        """As that of the other sampler."""
         self._powers.zero_()
         self._starts.zero_()
-        self._largest.fill_(1.0)
         self._revision, self._can_sample = None, None
+
+    def _empty(self) -> None:
+        self.forget_priorities()
+        self._largest.fill_(1.0)
 
     def dumps(self, path: str | Path) -> None:
         """Writes the state to a folder."""

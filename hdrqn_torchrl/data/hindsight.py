@@ -44,7 +44,7 @@ def relabel_subgoals(
     - the option ends where g is reached, or lost: it can't be chosen any more, and is worth nothing. Reaching the
       subgoal really pursued, or losing it, does not end an option for g, so there the recurrent state goes on; to cut
       the sequence there would leave out steps *because* of what they attained, which biases values. Every other end
-      (episode, time limit) ends one for g, too;
+      (episode, time limit, the option of the level above) ends one for g, too;
     - where g could not be chosen, since it had been attained before or was not available, a step is not eligible for
       the loss. The next eligible one starts an option, so these steps reach no target and no state that is trained.
 
@@ -84,8 +84,12 @@ def relabel_subgoals(
     stays = left & torch.cat([left[:, 1:], torch.ones_like(left[:, :1])], 1)
     reached, eligible = attained.gather(-1, subgoal), left.gather(-1, subgoal)
     lost = eligible & ~stays.gather(-1, subgoal) & ~reached & ~after.get(keys.DONE)
-    terminated = reached | lost | after.get(keys.TERMINATED)
-    cut = after.get(option_done_key) & ~attained.gather(-1, pursued) & stays.gather(-1, pursued)
+    ended, stayed = after.get(keys.TERMINATED), stays.gather(-1, pursued)
+    own = attained.gather(-1, pursued)  # what ends an option for the subgoal really pursued alone
+    dropped = left.gather(-1, pursued) & ~stayed & ~after.get(keys.DONE)
+    above = after.get(option_terminated_key) & ~own & ~dropped & ~ended  # the option of the level above ended
+    terminated = reached | lost | above | ended
+    cut = after.get(option_done_key) & ~own & stayed
     done = terminated | cut | ~stays.gather(-1, subgoal) | after.get(keys.DONE)
     init = torch.cat([told.get(option_init_key)[:, :1], done[:, :-1]], 1)
     reward = rewards.of(attained, reached, None if hazard_key is None else after.get(hazard_key))

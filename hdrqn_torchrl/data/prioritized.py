@@ -210,6 +210,11 @@ class PrioritizedSequenceSampler(PrioritizedSampler):
         if there.any():
             super().update_priority(place[there], priority.cpu()[there])
 
+    def forget_priorities(self) -> None:
+        """Gives all sequences the priority of new ones: what they teach has changed."""
+        self._sum_tree[self._starts.nonzero().squeeze(-1)] = 0.0
+        self._forget()
+
     def _empty(self) -> None:
         super()._empty()
         self._forget()

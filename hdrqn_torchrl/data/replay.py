@@ -86,6 +86,8 @@ class SequenceBuffer(TensorDictReplayBuffer):
         """
         if len(self):
             change(self._storage[:], newest=self._storage._last_cursor_index)
+            if isinstance(self._sampler, PrioritizedSequenceSampler | DevicePrioritySampler):
+                self._sampler.forget_priorities()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what ``state_dict`` returned.

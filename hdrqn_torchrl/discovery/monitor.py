@@ -15,6 +15,7 @@ from hdrqn_torchrl.discovery.relabelling import relabel
 from hdrqn_torchrl.discovery.selection import Selection
 from hdrqn_torchrl.discovery.settings import DiscoverySettings
 from hdrqn_torchrl.learning import Learner
+from hdrqn_torchrl.modules import SubgoalSuccess
 
 
 class Discovery:
@@ -35,6 +36,7 @@ class Discovery:
         steps: learns from steps, whose memory is relabelled.
         settings: when.
         options: learners whose memories hold options.
+        successes: how often subgoals are reached, which begin again for slots that get another event.
 
     Examples:
         >>> from hdrqn_torchrl.algorithms import make_v3
@@ -55,9 +57,10 @@ class Discovery:
         settings: DiscoverySettings,
         *,
         options: Sequence[Learner] = (),
+        successes: Sequence[SubgoalSuccess] = (),
     ) -> None:
         self.critic, self.selection, self.settings = critic, selection, settings
-        self.steps, self.options = steps, options
+        self.steps, self.options, self.successes = steps, options, successes
         self.frames = 0
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -90,6 +93,8 @@ class Discovery:
         kept = table.assign(chosen.slots, once=chosen.once, frames=self.frames)
         if all(torch.equal(old, new) for old, new in zip(before, (table.tokens, table.slots, table.once), strict=True)):
             return
+        for success in self.successes:
+            success.forget(~kept)
         if self.options and (in_use & ~kept).any():
             self._forget()
         else:

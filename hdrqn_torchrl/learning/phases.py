@@ -14,7 +14,7 @@ from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.learning.learner import Learner
 from hdrqn_torchrl.learning.legs import LegCounter
 from hdrqn_torchrl.learning.monitors import Monitor, VisitCounter
-from hdrqn_torchrl.modules import EpsilonGreedy, SubgoalSuccess
+from hdrqn_torchrl.modules import EpsilonGreedy, SubgoalSuccess, SuccessEpsilonGreedy
 from hdrqn_torchrl.modules.sizes import check_size
 
 
@@ -71,7 +71,7 @@ class Phases:
         (1, True)
         >>> no, subgoal = torch.zeros(2, 8, 1, dtype=torch.bool), torch.zeros(2, 8, dtype=torch.int64)
         >>> step = {"active_subgoal": subgoal, "option_done": no, "subgoal_reached": no}
-        >>> phases.observe(TensorDict({"next": step}, [2, 8]))
+        >>> phases.observe(TensorDict({"subgoal_mask": torch.ones(2, 8, 2).bool(), "next": step}, [2, 8]))
         >>> phases.phase, meta_exploration.held
         (2, False)
     """
@@ -88,6 +88,11 @@ class Phases:
         for name, each in zip([*["middle"] * (len(explorations) - 1), "meta"], explorations, strict=True):
             if each.start != 1.0:
                 raise ValueError(f"{name}_exploration.start must be 1.0 with phase_one, got {each.start}.")
+            if isinstance(each, SuccessEpsilonGreedy):
+                raise ValueError(
+                    f"{name}_exploration must choose at random with phase_one, got SuccessEpsilonGreedy, which follows "
+                    "success; use EpsilonGreedy."
+                )
         self.settings, self.explorations, self.learners = settings, explorations, learners
         success = SubgoalSuccess(num_subgoals, window=settings.window, names=names)
         self.success = success.to(explorations[-1].epsilon.device)

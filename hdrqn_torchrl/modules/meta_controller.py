@@ -169,6 +169,13 @@ class MetaController(TensorDictModuleBase):
             tensordict.set(self.action_value_key, value)
         due = gate.squeeze(-1)
         chosen = choose(
-            self.exploration, value, tensordict, self.exploration_key, mask=mask, condition=condition, due=due
+            self.exploration,
+            value,
+            tensordict,
+            self.exploration_key,
+            mask=mask,
+            condition=condition,
+            starts=None if init is None else init.squeeze(-1),
+            due=due,
         )
         return tensordict.set(self.subgoal_key, torch.where(due, chosen, tensordict.get(self.active_subgoal_key)))

@@ -15,11 +15,12 @@ from hdrqn_torchrl.modules.sizes import check_size
 class SubgoalSuccess(nn.Module):
     """Share of the options for each subgoal that reached it: a moving average over the last ones.
 
+    Options for a subgoal that could not be chosen to begin with do not count.
+
     Args:
         num_subgoals: G.
         window: number of options that the average goes over, or all of them while there are fewer.
-        names: entries of the set of subgoals, which :class:`~hdrqn_torchrl.transforms.SubgoalTransform` writes below
-            ``"next"``.
+        names: entries of the set of subgoals, which :class:`~hdrqn_torchrl.transforms.SubgoalTransform` writes.
 
     Raises:
         ValueError: if a number is not positive.
@@ -29,7 +30,7 @@ class SubgoalSuccess(nn.Module):
         >>> success = SubgoalSuccess(num_subgoals=2)
         >>> done, reached = torch.tensor([[[True], [True]]]), torch.tensor([[[True], [False]]])
         >>> step = {"active_subgoal": torch.tensor([[1, 1]]), "option_done": done, "subgoal_reached": reached}
-        >>> success.observe(TensorDict({"next": step}, [1, 2]))
+        >>> success.observe(TensorDict({"subgoal_mask": torch.ones(1, 2, 2).bool(), "next": step}, [1, 2]))
         >>> success.rates.tolist()
         [0.0, 0.5]
     """
@@ -50,19 +51,25 @@ class SubgoalSuccess(nn.Module):
         for name, value, usual in (("num_subgoals", num_subgoals, 6), ("window", window, 100)):
             check_size(name, value, usual)
         self.window = window
-        self._keys = [("next", key) for key in (names.active_subgoal, names.option_done, names.subgoal_reached)]
+        after = (names.active_subgoal, names.option_done, names.subgoal_reached)
+        self._keys = [names.subgoal_mask, *(("next", key) for key in after)]
         self.register_buffer("rates", torch.zeros(num_subgoals))
         self.register_buffer("options", torch.zeros(num_subgoals, dtype=torch.int64))
 
     def observe(self, batch: TensorDictBase) -> None:
         """Counts the options that ended in a collected batch ``[N, T]``; they are all equally recent."""
-        subgoal, done, reached = (batch.get(key) for key in self._keys)
-        pursued = one_hot(subgoal, len(self.rates)) * done.long()  # [N, T, G]
+        could, subgoal, done, reached = (batch.get(key) for key in self._keys)
+        pursued = one_hot(subgoal, len(self.rates)) * (done & could).long()  # [N, T, G]
         ended, won = pursued.flatten(0, -2).sum(0), (pursued * reached.long()).flatten(0, -2).sum(0)
         self.options += ended
         remembered = self.options.clamp(max=self.window).float()
         share = (ended / remembered.clamp(min=1)).clamp(max=1.0)
         self.rates.lerp_(won / ended.clamp(min=1), share)
+
+    def forget(self, subgoals: Tensor) -> None:
+        """Begins again for subgoals ``[G]`` bool that mean something else now."""
+        self.rates.masked_fill_(subgoals, 0.0)
+        self.options.masked_fill_(subgoals, 0)
 
 
 class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):

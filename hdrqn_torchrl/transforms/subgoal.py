@@ -31,14 +31,15 @@ class SubgoalTransform(Transform):
     4. ``option_return`` grows by :math:`\gamma^{k} r^{ex}`, ``option_steps`` :math:`= k + 1`;
     5. ``option_done`` = reached, or the episode is done, or ``max_option_steps`` are over, or :math:`g` can no
        longer be chosen, or the option of the level above is done; ``option_terminated`` = reached, or lost (:math:`g`
-       could be chosen before this step, cannot after it, and was not attained), or the episode terminated.
+       could be chosen before this step, cannot after it, and was not attained), or the option of the level above or
+       the episode terminated.
 
     The policy's ``subgoal`` becomes an additional action. Put every transform that can end an episode
     (``StepCounter(max_steps)``) *before* this one, so that each end of an episode closes its option.
 
     Several sets of subgoals, from far to near, have one book each, the farther one before the nearer one. The nearer
     one has a ``prefix`` and sums what the farther one pays: ``SubgoalTransform(5, prefix="rooms",
-    upper_done_key="option_done", extrinsic_reward_key="intrinsic_reward")``.
+    upper_done_key="option_done", upper_terminated_key="option_terminated", extrinsic_reward_key="intrinsic_reward")``.
 
     Args:
         num_subgoals: G.
@@ -55,7 +56,9 @@ class SubgoalTransform(Transform):
             such (:class:`~hdrqn_torchrl.transforms.Critic`). ``None``: the environment has to write it.
         prefix: of the names of all entries that concern this set of subgoals (:class:`~hdrqn_torchrl.keys.OptionKeys`),
             where they are not given below.
-        upper_done_key: ``option_done`` of the level above, written before in the same step; ``None``: there is none.
+        upper_done_key, upper_terminated_key: ``option_done`` and ``option_terminated`` of the level above, written
+            before in the same step; ``None``: there is none. Steps that attain the farther subgoal must teach something
+            about the nearer one, too: if they were left out, actions would be worth what they bring otherwise.
         hazard_key, extrinsic_reward_key: entries of the environment; ``hazard_key=None``: no hazard.
         done_key, terminated_key: end of the episode.
         attained_key: which subgoals a step attained.
@@ -89,6 +92,7 @@ class SubgoalTransform(Transform):
         critic: Verdict | None = None,
         prefix: str = "",
         upper_done_key: NestedKey | None = None,
+        upper_terminated_key: NestedKey | None = None,
         hazard_key: NestedKey | None = keys.HAZARD,
         extrinsic_reward_key: NestedKey = keys.EXTRINSIC_REWARD,
         done_key: NestedKey = keys.DONE,
@@ -124,11 +128,13 @@ class SubgoalTransform(Transform):
         self.intrinsic_reward_key = intrinsic_reward_key or names.intrinsic_reward
         self.hazard_key = hazard_key if hazard_reward else None
         self.available_key, self.extrinsic_reward_key = available_key, extrinsic_reward_key
-        self.done_key, self.terminated_key, self.upper_done_key = done_key, terminated_key, upper_done_key
+        self.done_key, self.terminated_key = done_key, terminated_key
+        self.upper_done_key, self.upper_terminated_key = upper_done_key, upper_terminated_key
         self._carried = [self.option_init_key, self.active_subgoal_key, self.subgoal_mask_key]
         self._carried += [self.option_steps_key, self.option_return_key]
         self._reported = [self.subgoal_reached_key, self.option_done_key, self.option_terminated_key]
-        read = [self.hazard_key, available_key, upper_done_key, None if critic else self.attained_key]
+        upper = [upper_done_key, upper_terminated_key]
+        read = [self.hazard_key, available_key, *upper, None if critic else self.attained_key]
         in_keys = [extrinsic_reward_key, *(key for key in read if key is not None)]
         super().__init__(in_keys=in_keys, out_keys=[*self._carried, *self._reported, self.intrinsic_reward_key])
         self.num_subgoals, self.gamma, self.max_option_steps = num_subgoals, gamma, max_option_steps
@@ -159,6 +165,8 @@ class SubgoalTransform(Transform):
         done = reached | next_tensordict.get(self.done_key)
         if self.upper_done_key is not None:
             done = done | next_tensordict.get(self.upper_done_key)
+        if self.upper_terminated_key is not None:
+            terminated = terminated | next_tensordict.get(self.upper_terminated_key)
         if self.max_option_steps is not None:
             done = done | (steps >= self.max_option_steps)
         if self.available_key is not None or not self.repeatable:
@@ -233,7 +241,7 @@ class SubgoalTransform(Transform):
         entries = Entries(output_spec.shape, *parts)
         if self.critic is None:
             entries.require_flags(self.attained_key, self.num_subgoals)
-        for key in (self.hazard_key, self.upper_done_key):
+        for key in (self.hazard_key, self.upper_done_key, self.upper_terminated_key):
             if key is not None:
                 entries.require_flags(key)
         if self.available_key is not None:

@@ -184,7 +184,10 @@ def test_targets_of_three_levels_by_hand():
             assert result["target"].item() == pytest.approx(wanted.mean().item(), abs=1e-4), level
         assert learner.loss(pairs[cut])["trained_steps"] == 0
         counted[level] = int(cut.sum())
-    assert counted["sub"] > 5
+    after = batch["next"]
+    from_above = after["option_terminated"] & ~after["rooms_subgoal_reached"] & ~after["terminated"]
+    assert from_above.sum() > 5 and after["rooms_option_terminated"][from_above].all()
+    assert counted["sub"] == 0  # nothing is left out because of what it attained
 
 
 @pytest.mark.parametrize(
@@ -225,6 +228,22 @@ def test_hindsight_and_refreshed_states_work_at_the_lowest_levels():
     for learner in algorithm.learners.values():
         assert learner.learn()["loss"].isfinite()
     assert algorithm.learners["rooms"].replay.refresh is not None and algorithm.learners["meta"].replay.refresh is None
+
+
+class Told(EpsilonGreedy):
+    """Remembers where it is told that what it goes along with begins."""
+
+    def forward(self, values, *, starts=None, **given):
+        self.__dict__.setdefault("starts", []).append(starts)
+        return super().forward(values, starts=starts, **given)
+
+
+@pytest.mark.parametrize("name", ["v1", "v2", "v3"])
+def test_a_middle_exploration_is_told_where_options_of_the_level_above_begin(name):
+    algorithm, env = three_levels(name, middle_exploration=Told(1.0))
+    (batch,) = collect(algorithm, env, 20)
+    told = torch.stack(algorithm.explorations["rooms"].starts[1:21], 1)  # the collector tries the policy first
+    assert torch.equal(told, batch["option_init"].squeeze(-1)) and told[:, 1:].any()
 
 
 @pytest.mark.parametrize("name", ["hdqn", "v1", "v2", "v3"])

@@ -133,6 +133,13 @@ class TestRelabelSubgoals:
                 {"pursued": "1111", "reward": [0.0, 0.0, 0.0, 0.0], "init": "02", "done": "13", "terminated": "",
                  "eligible": "0123"},
             ),
+            # The option of the level above terminated at step 1: that ends one for goal 1, too, which is worth nothing.
+            (
+                {"pursued": "0000", "attained": "00 00 00 00", "mask": "11 11 11 11", "init": "02", "done": "1",
+                 "terminated": "1", "episode_done": "", "reward": [0.0, 0.0, 0.0, 0.0]},
+                {"pursued": "1111", "reward": [0.0, 0.0, 0.0, 0.0], "init": "02", "done": "1", "terminated": "1",
+                 "eligible": "0123"},
+            ),
             # An option whose subgoal was gone lasts one step, but goal 1 was not gone.
             (
                 {"pursued": "000", "attained": "00 00 01", "mask": "01 01 01", "init": "012", "done": "012",
@@ -162,6 +169,7 @@ class TestRelabelSubgoals:
     def test_a_truncated_episode_ends_for_every_subgoal(self):
         sample = sequence(**BOTH_REACHED)
         sample["next", "terminated"].fill_(False)
+        sample["next", "option_terminated"][0, 4] = False
         sample["next", "attained"][0, 4] = torch.tensor([True, False])  # goal 1 was pursued, goal 0 reached
         for done in (False, True):
             sample["next", "done"][0, 4] = sample["next", "option_done"][0, 4] = done

@@ -194,6 +194,17 @@ class TestNewSteps:
         world.extend(2)
         assert set(starts_of(world.sample())) >= {(0, 2), (0, 3)}
 
+    def test_steps_that_were_rewritten_are_new(self):
+        torch.manual_seed(0)
+        world = World("steps", rows=60)
+        world.extend(20)
+        world.set_priorities(lambda env, time: 8.0 if time == 3 else 0.5)
+        world.buffer.rewrite(lambda steps, newest: None)
+        sample = world.sample()
+        assert len(set(starts_of(sample))) > 15
+        weight = sample["priority_weight"][:, 0]
+        assert (weight == weight[0]).all() and weight[0].item() == pytest.approx((8 + FLOOR) ** (-ALPHA * 0.6))
+
     def test_overwritten_steps_leave_no_priority(self):
         torch.manual_seed(0)
         world = World("steps", num_envs=2, rows=12, longest=1)

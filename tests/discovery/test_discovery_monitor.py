@@ -8,16 +8,17 @@ from hand_given import BOTH_GOALS, HandGiven
 from helpers import build, make_collector, small_env, tiny_settings
 
 from hdrqn_torchrl.discovery import Chosen
+from hdrqn_torchrl.modules import SuccessEpsilonGreedy
 
 FRAMES = 32  # of a batch: four worlds, eight steps
 
 
-def agent_and_batches(batches=8, learner=None, name="v3", **settings):
+def agent_and_batches(batches=8, learner=None, name="v3", sub_exploration=None, **settings):
     """An agent that has seen nothing yet, and what it goes on to see."""
     env = small_env()
     discovery = HandGiven(max_subgoals=2, **({"warmup_frames": 1, "discovery_frames": 64} | settings))
     settings = tiny_settings(slice_len=7, **(learner or {}))
-    options = {} if name == "v3" else {"sub_hindsight": True}
+    options = {"sub_exploration": sub_exploration} | ({} if name == "v3" else {"sub_hindsight": True})
     agent = build(name, env, settings=settings, subgoals="discovered", discovery=discovery, **options)
     return agent, islice(make_collector(agent, env, 8), batches)
 
@@ -70,6 +71,20 @@ def test_v2_relabels_steps_and_forgets_options_whose_subgoal_has_another_meaning
                 assert steps["subgoal_mask"][..., 2].any()
     assert [rows // FRAMES for rows in stored["sub"]] == [0, 1, 2, 3, 4, 0]  # the first batch taught the detector
     assert stored["meta"][0] == stored["meta"][5] == 0 < stored["meta"][4]
+
+
+@pytest.mark.parametrize("name", ["v2", "v3"])
+def test_exploration_by_success_begins_again_where_a_subgoal_has_another_meaning_now(name):
+    exploration = SuccessEpsilonGreedy(1.0, 0.05)
+    chosen = Chosen({1: 1, 2: 2}), Chosen({2: 2}), Chosen({5: 1, 2: 2})
+    agent, batches = agent_and_batches(6, name=name, chosen=chosen, sub_exploration=exploration)
+    success = agent.explorations["sub"].success
+    assert success is exploration.success
+    for number, batch in enumerate(batches):
+        agent.observe(batch)
+        if number == 2:
+            success.rates[1:], success.options[1:] = 0.9, 500
+    assert success.options[1] < 100 <= success.options[2] and success.rates[2] > 0 == success.rates[1]
 
 
 def test_options_that_wait_for_the_end_of_their_episode_are_forgotten_too():

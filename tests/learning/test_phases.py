@@ -6,7 +6,7 @@ from helpers import build, collect, small_env, tiny_settings
 from tensordict import TensorDict
 
 from hdrqn_torchrl.learning import PhaseOne, Phases
-from hdrqn_torchrl.modules import EpsilonGreedy
+from hdrqn_torchrl.modules import EpsilonGreedy, SuccessEpsilonGreedy
 
 
 def options(*reached):
@@ -20,6 +20,7 @@ def options(*reached):
     }
     init = torch.arange(len(reached)).view(1, -1, 1) == 0
     root = {"is_init": init, "option_init": torch.ones_like(init), "attained": torch.zeros(1, len(reached), 2).bool()}
+    root["subgoal_mask"] = torch.ones(1, len(reached), 2, dtype=torch.bool)
     return TensorDict({**root, "next": step}, [1, len(reached)])
 
 
@@ -72,6 +73,9 @@ class TestPhases:
     def test_the_meta_level_must_choose_at_random(self):
         with pytest.raises(ValueError, match=r"meta_exploration\.start must be 1\.0 with phase_one, got 0\.5"):
             Phases(PhaseOne(), 2, [EpsilonGreedy(0.5)], [])
+        message = "middle_exploration must choose at random with phase_one, got SuccessEpsilonGreedy"
+        with pytest.raises(ValueError, match=message):
+            Phases(PhaseOne(), 2, [SuccessEpsilonGreedy(1.0), EpsilonGreedy(1.0)], [])
 
     @pytest.mark.parametrize(
         "settings", [{"success": 0.0}, {"success": 1.1}, {"max_frames": 0}, {"min_options": 0}, {"window": 0}], ids=str

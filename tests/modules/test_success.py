@@ -7,11 +7,12 @@ from hdrqn_torchrl.keys import OptionKeys
 from hdrqn_torchrl.modules import SubgoalSuccess, SuccessEpsilonGreedy
 
 
-def batch(*options):
-    """A batch ``[1, T]`` of steps, each (subgoal, done, reached)."""
+def batch(*options, num_subgoals=1):
+    """A batch ``[1, T]`` of steps, each (subgoal, done, reached); all subgoals can be chosen."""
     subgoal, done, reached = (torch.tensor(column)[None] for column in zip(*options, strict=True))
     step = {"active_subgoal": subgoal, "option_done": done[..., None], "subgoal_reached": reached[..., None]}
-    return TensorDict({"next": step}, [1, len(options)])
+    mask = torch.ones(1, len(options), 3, dtype=torch.bool)
+    return TensorDict({"subgoal_mask": mask[..., :num_subgoals], "next": step}, [1, len(options)])
 
 
 WON, LOST, GOES_ON = (0, True, True), (0, True, False), (0, False, False)
@@ -20,7 +21,7 @@ WON, LOST, GOES_ON = (0, True, True), (0, True, False), (0, False, False)
 class TestSubgoalSuccess:
     def test_the_share_of_options_that_reached_their_subgoal(self):
         success = SubgoalSuccess(3)
-        success.observe(batch(WON, LOST, GOES_ON, WON, (2, True, False), LOST))
+        success.observe(batch(WON, LOST, GOES_ON, WON, (2, True, False), LOST, num_subgoals=3))
         assert success.rates.tolist() == [0.5, 0.0, 0.0]
         assert success.options.tolist() == [4, 0, 1]
 
@@ -38,6 +39,20 @@ class TestSubgoalSuccess:
         assert success.rates.item() == pytest.approx(0.25)
         success.observe(batch(*[WON] * 8))
         assert success.rates.item() == 1.0
+
+    def test_options_that_could_not_succeed_do_not_count(self):
+        success, steps = SubgoalSuccess(2), batch(WON, LOST, (1, True, True), num_subgoals=2)
+        steps["subgoal_mask"][0, 1, 0] = False  # attained before: the option ended at once
+        success.observe(steps)
+        assert success.rates.tolist() == [1.0, 1.0] and success.options.tolist() == [1, 1]
+
+    def test_a_subgoal_that_means_something_else_begins_again(self):
+        success = SubgoalSuccess(2, window=10)
+        success.observe(batch(WON, WON, (1, True, True), num_subgoals=2))
+        success.forget(torch.tensor([False, True]))
+        assert success.rates.tolist() == [1.0, 0.0] and success.options.tolist() == [2, 0]
+        success.observe(batch((1, True, False), (1, True, True), num_subgoals=2))
+        assert success.rates.tolist() == [1.0, 0.5]
 
     def test_steps_that_end_no_option_change_nothing(self):
         success = SubgoalSuccess(1)
@@ -87,7 +102,8 @@ class TestSuccessEpsilonGreedy:
     def test_it_reads_the_entries_of_the_set_of_subgoals_that_it_is_given(self):
         exploration = SuccessEpsilonGreedy()
         exploration.set_num_subgoals(2, names=OptionKeys("rooms"))
-        steps = batch(WON)
+        steps = batch(WON, num_subgoals=2)
+        steps.rename_key_("subgoal_mask", "rooms_subgoal_mask")
         for key in ("active_subgoal", "option_done", "subgoal_reached"):
             steps.rename_key_(("next", key), ("next", f"rooms_{key}"))
         exploration.observe(steps)

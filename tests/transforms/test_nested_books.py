@@ -54,7 +54,12 @@ def books(**near):
     far = SubgoalTransform(FAR, gamma=0.5, max_option_steps=9, wrong_subgoal_reward=-0.5)
     settings = {"max_option_steps": 4, "hazard_reward": -0.25, "gamma": 0.75} | near
     return far, SubgoalTransform(
-        NEAR, prefix="rooms", upper_done_key="option_done", extrinsic_reward_key="intrinsic_reward", **settings
+        NEAR,
+        prefix="rooms",
+        upper_done_key="option_done",
+        upper_terminated_key="option_terminated",
+        extrinsic_reward_key="intrinsic_reward",
+        **settings,
     )
 
 
@@ -69,7 +74,7 @@ class Book:
         self.prefix, self.size, self.book = prefix, size, book
         self.mask, self.subgoal, self.steps, self.collected, self.init = [True] * size, 0, 0, 0.0, True
 
-    def step(self, root, after, upper_done, pay):
+    def step(self, root, after, upper_done, upper_terminated, pay):
         """Takes one step; returns what should have been written."""
         if self.init:
             self.subgoal, self.steps, self.collected = root[self.prefix + "subgoal"].item(), 0, 0.0
@@ -85,7 +90,7 @@ class Book:
         elif not self.book.repeatable:
             self.mask = [left and not now for left, now in zip(self.mask, attained, strict=True)]
         gone = not was or not self.mask[self.subgoal]
-        terminated = terminated or (was and gone and not reached and not after["done"].item())
+        terminated = terminated or (was and gone and not reached and not after["done"].item()) or upper_terminated
         done = reached or gone or upper_done or after["done"].item() or self.steps >= self.book.max_option_steps
         self.init = done
         values = (done, self.subgoal, self.mask, self.steps, self.collected, reached, done, reached or terminated)
@@ -109,8 +114,10 @@ def test_two_books_agree_with_plain_loops(near):
                 far, nearer = Book("", FAR, far.book), Book("rooms_", NEAR, nearer.book)
             assert (step["option_init"].item(), step["rooms_option_init"].item()) == (far.init, nearer.init)
             assert nearer.init or not far.init  # who starts above starts below
-            expected = far.step(step, step["next"], False, step["next", "extrinsic_reward"].item())
-            expected |= nearer.step(step, step["next"], expected["option_done"], expected["intrinsic_reward"])
+            expected = far.step(step, step["next"], False, False, step["next", "extrinsic_reward"].item())
+            expected |= nearer.step(
+                step, step["next"], *(expected[key] for key in ("option_done", "option_terminated", "intrinsic_reward"))
+            )
             for key, value in expected.items():
                 found = step["next", key]
                 torch.testing.assert_close(found.float().view(-1), torch.tensor(value).float().view(-1), msg=key)
