@@ -21,7 +21,8 @@ levels above the first learn only from the first step of each option, with the r
 
 .. math:: y = r_0 + \gamma r_1 + \ldots + \gamma^k ((1 - \lambda') \max_{x'} Q(s_k, x') + \lambda' y_k)
 
-with :math:`\lambda'` = lambda if the next subgoal is the greedy one, else 0.
+with :math:`\lambda'` = lambda if the next subgoal is the greedy one, else 0. Where the sequence breaks off within an
+option, :math:`Q'(s_k, x)` stands in: without options that do not end, all would seem to succeed.
 
 If the network has a predictor, the memory is also trained to predict the observations of the next few steps.
 """
@@ -71,9 +72,9 @@ class AllSubgoalsLoss(SequenceLoss):
             attained in a step (key ``bonus``).
         double: Double Q-learning.
         all_subgoals: ``False``: each level learns only about the subgoal that was pursued.
-        intra_option: ``False``: levels that choose subgoals learn only from the first steps of options, and only of
-            options that end within the sequence. (With ``True``, options are assumed to last until their subgoal is
-            attained or lost; a step limit of options is ignored.)
+        intra_option: ``False``: levels that choose subgoals learn only from the first steps of options; where the
+            sequence breaks off within an option, the value of its subgoal stands in. (With ``True``, options are
+            assumed to last until their subgoal is attained or lost; a step limit of options is ignored.)
         max_meta_target, min_meta_target: largest and smallest possible return of the task, if known; the top level's
             targets are clipped to this range.
         burn_in, train_exact_states: which steps enter the loss, see :func:`~hdrqn_torchrl.objectives.training_mask`;

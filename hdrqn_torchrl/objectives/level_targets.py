@@ -153,10 +153,11 @@ class LevelTargets:
             following = torch.where(over, best, target[:, 1:])
             trace = watkins_trace(agrees, self.trace_decay)[:, :-1].unsqueeze(-2).masked_fill(over, 0.0)
         else:
-            whole = _ends_in_sequence(names, tensordict, events)
-            may_learn = may_learn & pursued & steps[names.option_init] & whole.unsqueeze(-1)
-            following = best
-            trace = self._option_trace(rule, online, whole, tensordict).unsqueeze(-1)
+            may_learn = may_learn & pursued & steps[names.option_init]
+            active = steps["next", names.active_subgoal][..., None, None].expand(*best.shape[:-1], 1)
+            goes_on = target[:, 1:].gather(-1, active)  # stands in where the sequence breaks off within an option
+            following = torch.where(tensordict[names.option_init][:, 1:].unsqueeze(-1), best, goes_on)
+            trace = self._option_trace(rule, online, tensordict).unsqueeze(-1)
         trained = (steps[names.subgoal_mask] & may_learn).unsqueeze(-2)
         shape = target[:, 1:].shape
         return self._finish(
@@ -203,15 +204,14 @@ class LevelTargets:
             trained=(trained & ~unseen.unsqueeze(-1)).flatten(-2),
         )
 
-    def _option_trace(self, rule: LevelRule, online: Tensor, whole: Tensor, tensordict: TensorDictBase) -> Tensor:
+    def _option_trace(self, rule: LevelRule, online: Tensor, tensordict: TensorDictBase) -> Tensor:
         """Traces ``[B, T, C]`` along options: 1 inside an option; lambda across to the next option if that is the
-        greedy choice and ends within the sequence, else 0."""
+        greedy choice, else 0."""
         assert rule.choices is not None
         names = rule.choices
         active = tensordict["next", names.active_subgoal].unsqueeze(-1)
         agrees = greedy_choice(online, _mask(rule, tensordict)) == active
         to_next = watkins_trace(agrees, self.trace_decay)[:, :-1]
-        to_next[:, :-1] *= whole[:, 1:].unsqueeze(-1)
         return torch.where(tensordict[names.option_init][:, 1:], to_next, 1.0)
 
 
@@ -274,13 +274,3 @@ def _pursued(names: OptionKeys, steps: TensorDictBase) -> Tensor:
 def _mask(rule: LevelRule, tensordict: TensorDictBase) -> Tensor | None:
     """What the level can choose, ``[B, T + 1, 1, X]`` bool; ``None``: everything."""
     return None if rule.mask_key is None else tensordict[rule.mask_key].unsqueeze(-2)
-
-
-def _ends_in_sequence(names: OptionKeys, tensordict: TensorDictBase, events: StepEvents) -> Tensor:
-    """Steps ``[B, T]`` whose option ends within the sequence, with a known outcome."""
-    seen = ~events.unseen
-    ends = (tensordict[names.option_init].squeeze(-1)[:, 1:] | events.terminated) & seen
-    found = [torch.zeros_like(ends[:, 0])]
-    for end, visible in zip(reversed(ends.unbind(1)), reversed(seen.unbind(1)), strict=True):
-        found.append(end | (found[-1] & visible))
-    return torch.stack(found[:0:-1], 1)

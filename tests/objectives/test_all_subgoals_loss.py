@@ -207,31 +207,31 @@ class Reference:
         if not self.s.all_subgoals:
             belongs = pursued
         if not self.s.intra_option:
-            belongs = pursued and self.starts[b][t] and self.option_end(b, t) is not None
+            belongs = pursued and self.starts[b][t]
         return self.left[b][t][g] and not self.cut_off(b, t) and belongs
 
-    def option_end(self, b, t):
-        """The last step of the option in progress at ``t``, if the outcome of that step is known."""
-        while t < self.steps - 1 and not self.cut_off(b, t):
-            if self.terminated[b][t] or self.starts[b][t + 1]:
-                return t
-            t += 1
-        return None
-
     def option_target(self, b, t):
-        """The return of the whole option, plus the best value after it."""
-        last = self.option_end(b, t)
-        total = sum(self.s.meta_gamma ** (i - t) * self.extrinsic[b][i] for i in range(t, last + 1))
-        if self.terminated[b][last]:
-            return total
-        left = [other for other in range(self.subgoals) if self.left[b][last + 1][other]]
-        chooser = (self.m if self.s.double else self.target_m)[b][last + 1]
-        following = self.target_m[b][last + 1][max(left, key=lambda other: chooser[other])]
-        greedy = max(left, key=lambda other: self.m[b][last + 1][other]) == self.subgoal[b][last + 1]
-        if greedy and last + 1 < self.steps - 1 and self.option_end(b, last + 1) is not None:
+        """The return of the whole option plus the best value after it or, where it breaks off, that of going on."""
+        total, discount, subgoal = 0.0, 1.0, self.subgoal[b][t]
+        while True:
+            total += discount * self.extrinsic[b][t]
+            discount *= self.s.meta_gamma
+            if self.terminated[b][t]:
+                return total
+            t += 1
+            unknown = t == self.steps - 1 or self.cut_off(b, t)
+            if self.starts[b][t]:
+                break
+            if unknown:
+                return total + discount * self.target_m[b][t][subgoal]
+        left = [other for other in range(self.subgoals) if self.left[b][t][other]]
+        chooser = (self.m if self.s.double else self.target_m)[b][t]
+        following = self.target_m[b][t][max(left, key=lambda other: chooser[other])]
+        greedy = max(left, key=lambda other: self.m[b][t][other]) == self.subgoal[b][t]
+        if greedy and not unknown:
             decay = self.s.trace_decay
-            following = (1 - decay) * following + decay * self.option_target(b, last + 1)
-        return total + self.s.meta_gamma ** (last + 1 - t) * following
+            following = (1 - decay) * following + decay * self.option_target(b, t)
+        return total + discount * following
 
     def sub_target(self, b, t, g):
         reward = self.s.reached_reward if self.attained[b][t][g] else 0.0
