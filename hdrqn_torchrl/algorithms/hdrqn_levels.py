@@ -56,6 +56,7 @@ class LevelBuilder:
     repeatable_subgoals: bool | None
     hazard_reward: float
     penalties: tuple[float, ...]
+    max_option_steps: int | None
     sub_hindsight: bool
     meta_hindsight: bool
     prediction_steps: int
@@ -119,6 +120,7 @@ class LevelBuilder:
         pursued, hindsight = _keys_above(level), self.sub_hindsight
         starts = [keys.IS_INIT] if settings.sampling in FROM_STARTS or has.event_keys else []
         told: list[NestedKey] = [pursued.attained, *has.event_keys, *has.hazard_keys] if hindsight else []
+        limit = None if self.max_option_steps == 1 else self.max_option_steps  # of one step nothing would be left
         with settings_named(level.name):
             return Learner(
                 controller,
@@ -134,13 +136,15 @@ class LevelBuilder:
                     next_keys=[*_ends(pursued).values(), *told],
                     subgoal_key=pursued.subgoal,
                     active_subgoal_key=pursued.active_subgoal,
+                    option_limit=limit,
+                    option_steps_key=pursued.option_steps,
                 ),
                 loss=make_recurrent_loss(
                     controller,
                     settings,
                     gamma=self.gamma,
                     largest_return=self._rewards(0).largest_return,
-                    loss_keys={"eligible": keys.ELIGIBLE if hindsight else None},
+                    loss_keys={"eligible": keys.ELIGIBLE if hindsight or limit else None},
                     prediction_weight=self.prediction_weight,
                 ),
                 num_envs=has.num_envs,

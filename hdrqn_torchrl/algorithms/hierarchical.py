@@ -95,7 +95,8 @@ def make_hdrqn(
         wrong_subgoal_reward: intrinsic reward for attaining another subgoal than the chosen one; one number for the
             farthest set, or one for each set from near to far.
         hazard_reward: intrinsic reward for meeting the hazard.
-        max_option_steps: step limit of an option, among the nearest subgoals.
+        max_option_steps: step limit of an option, among the nearest subgoals. The last step that an option may have
+            teaches the sub level nothing, whatever it brings (with a limit of 1: only if it attains the subgoal).
         sub_hindsight: learn about every subgoal from each sequence (:func:`~hdrqn_torchrl.data.relabel_subgoals`); a
             minibatch then holds ``sub.batch_size`` times the number of subgoals.
         meta_hindsight: learn from options as if they had been chosen for what they attained, too
@@ -139,6 +140,7 @@ def make_hdrqn(
         repeatable_subgoals=repeatable_subgoals,
         hazard_reward=hazard_reward,
         penalties=tuple(penalties_of_sets(wrong_subgoal_reward, levels - 1)),
+        max_option_steps=max_option_steps,
         sub_hindsight=sub_hindsight,
         meta_hindsight=meta_hindsight,
         prediction_steps=prediction_steps,

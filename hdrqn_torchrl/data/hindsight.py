@@ -58,7 +58,8 @@ def relabel_subgoals(
         attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``;
             ``hazard_key=None``: no hazard.
         mask_key, option_init_key: at the root, like the subgoal.
-        eligible_key: written at the root, for :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss`.
+        eligible_key: written at the root, for :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss`; steps that are not
+            eligible in ``sample`` stay so.
 
     Returns:
         ``[G * B, T]``, the sequences as they were first. An update costs accordingly more; a batch size of B / G costs
@@ -103,7 +104,9 @@ def relabel_subgoals(
     told.set(subgoal_key, subgoal.squeeze(-1))
     for key in state_keys:
         told.set(key, told.get(key).masked_fill(shift > 0, 0.0))
-    return told.set(eligible_key, (shift == 0) | eligible)
+    before = told.get(eligible_key, None)  # the last steps that options may have
+    eligible = (shift == 0) | eligible
+    return told.set(eligible_key, eligible if before is None else eligible & before)
 
 
 class HindsightOptions:

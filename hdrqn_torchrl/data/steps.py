@@ -21,6 +21,9 @@ class StepSelector:
         subgoal_key: if given, the subgoal in force at each step is stored under this name (in a policy's raw output
             this entry is a mere proposal).
         active_subgoal_key: where the environment wrote the subgoal in force.
+        option_limit: if given, ``eligible`` is stored: false for the last of so many steps that an option may have.
+            Where it fails there, what would follow is unknown; to learn only where it succeeds would bias values.
+        option_steps_key: where the environment wrote how long an option has lasted.
         traj_key: number of the episode.
 
     Examples:
@@ -40,10 +43,13 @@ class StepSelector:
         next_keys: Sequence[NestedKey],
         subgoal_key: NestedKey | None = None,
         active_subgoal_key: NestedKey = keys.ACTIVE_SUBGOAL,
+        option_limit: int | None = None,
+        option_steps_key: NestedKey = keys.OPTION_STEPS,
         traj_key: NestedKey = keys.TRAJ_IDS,
     ) -> None:
         self.root_keys, self.subgoal_key, self.active_subgoal_key = list(root_keys), subgoal_key, active_subgoal_key
         self.next_keys = [*next_keys, keys.DONE, keys.TERMINATED]
+        self.option_limit, self.option_steps_key = option_limit, option_steps_key
         self.traj_key = traj_key
 
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
@@ -51,6 +57,8 @@ class StepSelector:
         steps, after = batch.select(*self.root_keys, self.traj_key), batch.get("next")
         if self.subgoal_key is not None:
             steps.set(self.subgoal_key, after.get(self.active_subgoal_key))
+        if self.option_limit is not None:
+            steps.set(keys.ELIGIBLE, after.get(self.option_steps_key) < self.option_limit)
         truncated = [keys.TRUNCATED] if keys.TRUNCATED in after else []  # not every environment has it
         return steps.set("next", after.select(*self.next_keys, *truncated))
 

@@ -324,17 +324,20 @@ class TestOptions:
         value_everything_at(meta, 8.0)
         assert meta.loss(options)["target"].item() == pytest.approx(0.25 + discount * 8)
 
-    def test_sub_targets_end_at_the_subgoal_and_are_left_out_at_time_limits(self):
-        algorithm, batch = self.steps(gamma=0.5, max_option_steps=2, settings=unbounded())
+    @pytest.mark.parametrize("hindsight", [False, True])
+    def test_sub_targets_end_at_the_subgoal_and_are_left_out_at_time_limits(self, hindsight):
+        """At the limit whatever happened there: of those that fail, what follows is unknown."""
+        algorithm, batch = self.steps(gamma=0.5, max_option_steps=2, settings=unbounded(), sub_hindsight=hindsight)
         sub, after = algorithm.learners["sub"], batch["next"]
         value_everything_at(sub, 8.0)
+        at_limit = after["option_steps"] == 2
         reached = after["subgoal_reached"] & ~after["terminated"]
-        timed_out = after["option_done"] & ~after["subgoal_reached"] & ~after["terminated"]
         goes_on = ~after["option_done"]
         steps = sub.extract(batch)
         pairs = torch.stack([steps[:, :-1], steps[:, 1:]], 2)
         pairs["option_init"][..., 0, :] = True
-        for rows, following in ((reached, 0.0), (goes_on, 0.5 * 8.0), (timed_out, None)):
+        cases = ((reached & ~at_limit, 0.0), (goes_on, 0.5 * 8.0), (reached & at_limit, None), (at_limit, None))
+        for rows, following in cases:
             chosen = pairs[rows[:, :-1].squeeze(-1)]
             result = sub.loss(chosen)
             assert len(chosen) and result["trained_steps"] == (0 if following is None else len(chosen))

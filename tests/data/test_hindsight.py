@@ -201,6 +201,12 @@ class TestRelabelSubgoals:
         kept, told = relabel_subgoals(sample, 2, state_keys=["hidden"])["hidden"]
         assert torch.equal(kept, sample["hidden"][0]) and not told.any()
 
+    def test_steps_that_must_not_be_trained_are_not_trained_for_other_subgoals_either(self):
+        sample = sequence(**ON_THE_WAY)
+        sample["eligible"] = torch.tensor([True, True, False, True]).view(1, 4, 1)
+        found = relabel_subgoals(sample, 2)["eligible"].squeeze(-1)
+        assert found.tolist() == [[True, True, False, True], [True, True, False, False]]
+
     def test_a_single_subgoal_needs_no_relabelling(self):
         played = {"pursued": "00", "attained": "0 1", "mask": "1 1", "init": "0", "done": "1", "terminated": "1"}
         sample = sequence(**played, reward=[0.0, 1.0])

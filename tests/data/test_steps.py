@@ -1,3 +1,4 @@
+import torch
 from helpers import random_play
 
 from hdrqn_torchrl.data import OptionExtractor, StepSelector
@@ -19,6 +20,11 @@ class TestStepSelector:
         kept = StepSelector(root_keys=["subgoal"], next_keys=[], subgoal_key="subgoal")(steps)
         assert (kept["subgoal"] == steps["next", "active_subgoal"]).all() and "subgoal" not in kept["next"]
         assert (kept["subgoal"] != steps["subgoal"]).any()  # random play proposes at every step
+
+    def test_the_last_step_that_an_option_may_have_is_not_eligible(self):
+        steps = random_play(4, 30)
+        kept = StepSelector(root_keys=[], next_keys=[], option_limit=3)(steps)
+        assert torch.equal(kept["eligible"], steps["next", "option_steps"] < 3) and not kept["eligible"].all()
 
     def test_the_batch_is_left_as_it_was(self):
         steps = random_play(2, 6)
