@@ -46,9 +46,7 @@ OPTION_STEPS = "option_steps"  # [1] int64: k, steps of the option so far
 OPTION_RETURN = "option_return"  # [1] float32: discounted r^ex that the option has collected so far
 SUBGOAL_REACHED = "subgoal_reached"  # [1] bool: the active subgoal was reached in this step
 OPTION_DONE = "option_done"  # [1] bool: the option ended, for whatever reason
-OPTION_TERMINATED = (
-    "option_terminated"  # [1] bool: its subgoal was reached or lost, or the option above or the episode terminated
-)
+OPTION_TERMINATED = "option_terminated"  # [1] bool: subgoal reached or lost, or option above or episode terminated
 INTRINSIC_REWARD = "intrinsic_reward"  # [1] float32: r^in
 
 # Written by hindsight (data/hindsight.py).
