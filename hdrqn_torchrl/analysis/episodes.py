@@ -67,6 +67,8 @@ def _interval(name: str, values: Tensor, confidence: float) -> list[float] | Non
     if name in _SHARES:
         return list(share_interval(sample.mean().item(), len(sample), confidence=confidence))
     low, high = mean_interval(sample, confidence=confidence)
+    if name == "in_order_rate":
+        low, high = numpy.clip(low, 0.0, 1.0), numpy.clip(high, 0.0, 1.0)
     return None if numpy.isnan(low) else [low.item(), high.item()]
 
 

@@ -65,7 +65,8 @@ def align(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     """Curves on common positions, by linear interpolation inside the range of each, NaN outside.
 
     The common positions are all those of any curve. If these are more than twice those of the longest curve (clocks
-    never agree), they are as many as the longest has, evenly spaced.
+    never agree), they are as many as the longest has, evenly spaced over what half of the curves reach, and the ends of
+    each curve.
 
     Args:
         curves: positions and values of each, at least one with a point.
@@ -82,7 +83,10 @@ def align(curves: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
     grid = np.unique(np.concatenate([x for x, _ in curves]))
     longest = max(len(x) for x, _ in curves)
     if len(grid) > 2 * longest:
-        grid = np.linspace(grid[0], grid[-1], longest)
+        ends = np.array([(x[0], x[-1]) for x, _ in curves if len(x)])
+        half = (len(ends) - 1) // 2
+        first, last = np.sort(ends[:, 0])[-1 - half], np.sort(ends[:, 1])[half]
+        grid = np.unique(np.concatenate([np.linspace(first, last, longest), ends.ravel()]))
     missing = np.full(len(grid), np.nan)
     values = [np.interp(grid, x, y, left=np.nan, right=np.nan) if len(x) else missing for x, y in curves]
     return grid, np.stack(values)

@@ -44,10 +44,9 @@ def center_interval(
 ) -> tuple[Array, Array]:
     """Interval of the mean, or trimmed mean, of all values together, where each stratum is a sample of its own.
 
-    Welch and Satterthwaite's t over the strata (where two values each and unequal spreads are trimmed it holds 90 % for
-    95); of a trimmed mean after Tukey and McLaughlin (1963): the variance is
+    Welch and Satterthwaite's t over the strata; of a trimmed mean after Tukey and McLaughlin (1963): the variance is
     that of the values with those that are cut off moved to the last ones kept, its degrees of freedom count the kept
-    ones.
+    ones. Of a stratum that keeps fewer than two, the values count as they are: the interval is wider than it need be.
 
     Args:
         strata: values ``[*, R]`` each.
@@ -69,7 +68,8 @@ def center_interval(
     for values, its_kept in zip(strata, inside, strict=True):
         its_number = its_kept * kept_number / np.sum(inside, 0)  # ties at the ends are not all kept
         degrees = np.maximum(its_number - 1, 1)
-        squares = values.shape[-1] * np.clip(values, *ends).var(-1)
+        clipped = np.where(its_kept[..., None] < 2, values, np.clip(values, *ends))  # all at one value would not spread
+        squares = values.shape[-1] * clipped.var(-1)
         parts.append((squares * (degrees + 1) / degrees / kept_number**2, degrees))
     return _t_interval(center, parts, np.abs(everyone).max(-1), confidence)
 

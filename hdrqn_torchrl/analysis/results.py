@@ -54,7 +54,7 @@ def find_runs(patterns: Iterable[str]) -> list[Path]:
         patterns: folders or glob patterns; ``**`` is recursive.
 
     Returns:
-        Sorted, each folder once.
+        Sorted, each folder once: of a folder and links to it, the one whose name comes first.
     """
     found: set[Path] = set()
     for pattern in patterns:
@@ -63,7 +63,10 @@ def find_runs(patterns: Iterable[str]) -> list[Path]:
         root = str(Path(start).expanduser()) if start else "/" if pattern.startswith("/") else "."
         for place in glob.iglob(root, recursive=True):  # noqa: PTH207  (Path.glob wants relative ones)
             found.update(_runs_below(Path(place)))
-    return sorted(found)
+    kept: dict[Path, Path] = {}
+    for each in sorted(found):
+        kept.setdefault(each.resolve(), each)
+    return list(kept.values())
 
 
 def _runs_below(place: Path) -> Iterator[Path]:
@@ -119,7 +122,7 @@ def read_run(folder: Path) -> Run:
         raise ValueError(f"{folder / layout.METRICS} has no complete log point (a row with its frames) yet.")
     if not np.isfinite(frames).all():
         raise ValueError(f"{folder / layout.METRICS} must hold the frames of every row, got {frames.tolist()[:10]}.")
-    kept = frames <= _least_from_here(frames)
+    kept = _is_below_all_that_follow(frames)
     return Run(
         folder,
         {name: column[kept] for name, column in metrics.items()},
@@ -142,9 +145,10 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e300  # which NaN is not
 
 
-def _least_from_here(x: Array) -> Array:
-    """Smallest of each value and all that follow."""
-    return np.minimum.accumulate(x[::-1])[::-1]
+def _is_below_all_that_follow(x: Array) -> Array:
+    """Whether each value is smaller than all that follow it."""
+    least_from_here = np.minimum.accumulate(x[::-1])[::-1]
+    return np.append(x[:-1] < least_from_here[1:], True)
 
 
 def curve(run: Run, column: str, *, axis: str = "frames", smooth: float = 0) -> tuple[Array, Array]:
@@ -154,7 +158,8 @@ def curve(run: Run, column: str, *, axis: str = "frames", smooth: float = 0) -> 
         run: the run.
         column: column of ``metrics.csv``.
         axis: column of the positions.
-        smooth: centred moving average over this many log points, or over this share of the run's points if < 1.
+        smooth: centred moving average over this many log points, or over this share of the run's points if < 1;
+            evaluations (``greedy/``) stay as they are.
     """
     nothing = np.empty(0)
     x, y = run.metrics.get(axis, nothing), run.metrics.get(column, nothing)
@@ -163,9 +168,9 @@ def curve(run: Run, column: str, *, axis: str = "frames", smooth: float = 0) -> 
     known = np.isfinite(x) & np.isfinite(y)
     x, y = x[known], y[known]
     if len(x):
-        rising = np.append(x[:-1] < _least_from_here(x)[1:], True)
+        rising = _is_below_all_that_follow(x)
         x, y = x[rising], y[rising]
-    return x, smoothed(y, smooth)
+    return x, smoothed(y, 0 if column.startswith("greedy/") else smooth)
 
 
 def _is_flat(run: Run) -> bool:
@@ -225,6 +230,8 @@ def final_value(run: Run, column: str) -> float:
         x, y = curve(run, asked["column"], axis=asked["axis"])
         high = y >= float(asked["level"])
         return float(x[high.argmax()]) if high.any() else np.nan
+    if column == "greedy/intrinsic" and _is_flat(run):
+        return np.nan
     name = column.removeprefix("greedy/")
     for key in (f"{name}_mean", f"{name}_rate"):
         if key in run.summary:

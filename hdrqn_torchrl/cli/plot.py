@@ -17,7 +17,8 @@ by        what makes a group: algo (default), env, network, any setting (algo.su
 center    mean (default) or iqm, the interquartile mean; either with a 95 % t interval over seeds (of the IQM after
           Tukey and McLaughlin). One seed has none, nor have equal values; of two or three it is wide, and cut off
           where it would make a panel more than twice as high
-smooth    moving average over this number of log points or, if < 1, this share of a run (default 0: none)
+smooth    moving average over this number of log points or, if < 1, this share of a run (default 0: none); greedy
+          evaluations stay as they are
 pool      true: all tasks in one row of panels; intervals are of seeds, not of tasks (default: a row for each task)
 ceilings  known (default): scripted players where they have been measured; simulate: the others play, each for two
           minutes at most; none

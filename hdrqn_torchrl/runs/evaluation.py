@@ -210,6 +210,8 @@ def _play_once(
             _ask_for_a_limit(playing)
         tensordict, following = env.step_and_maybe_reset(policy(tensordict))
         after = tensordict.get("next")
+        if step + 1 == max_steps:
+            _end_options(after, task)
         sums = tracker.add(after)
         for observer in observers:
             observer.add_step(tensordict, playing)
@@ -229,6 +231,13 @@ def _play_once(
             "state the length of longer ones in its task, or let evaluations cut them off (max_steps)."
         )
     return episodes
+
+
+def _end_options(after: TensorDictBase, task: Task) -> None:
+    """Ends the options of all levels where episodes are cut off: one still going on has not reached its subgoal."""
+    for each in task.subgoals:
+        if (done := after.get(each.keys.option_done, None)) is not None:
+            after.set(each.keys.option_done, torch.ones_like(done))
 
 
 def _ask_for_a_limit(playing: Tensor) -> None:

@@ -42,9 +42,22 @@ class TestAlign:
     def test_positions_that_never_agree_become_evenly_spaced(self):
         clocks = [(np.array([0.0, 1.0, 2.0]) * (1 + shift), np.array([0.0, 1.0, 2.0])) for shift in (0, 0.1, 0.2, 0.3)]
         grid, values = align(clocks)
-        assert grid.tolist() == pytest.approx([0, 1.3, 2.6])
-        assert values[0] == pytest.approx([0, 1.3, NAN], nan_ok=True)
-        assert values[3] == pytest.approx([0, 1, 2])
+        assert grid.tolist() == pytest.approx([0, 1.1, 2, 2.2, 2.4, 2.6])  # half of them reach 2.2; and all ends
+        assert values[0] == pytest.approx([0, 1.1, 2, NAN, NAN, NAN], nan_ok=True)
+        assert values[3] == pytest.approx(np.array([0, 1.1, 2, 2.2, 2.4, 2.6]) / 1.3)
+
+    def test_the_last_points_of_clocks_that_never_agree_are_shown(self):
+        clocks = [(np.linspace(0, end, 4), np.linspace(0, 1, 4)) for end in (90.0, 93.0, 97.0, 101.0, 110.0)]
+        x, values = align(clocks)
+        shown = estimate(x, values).value
+        assert x[~np.isnan(shown)][-1] == 97 and np.nanmax(shown) > 0.9
+
+    def test_a_short_run_between_the_common_positions_is_not_lost(self):
+        clocks = [(np.array([0.1, 100.0]), np.array([0.0, 1.0]) + run) for run in range(3)]
+        clocks = [(x + run * np.array([0.1, 10.0]), y) for run, (x, y) in enumerate(clocks)]
+        x, values = align(clocks)
+        assert not np.isnan(values).all(1).any()
+        assert estimate(x, values).value[x == 110].item() > 0
 
     def test_a_run_without_values_has_a_row_of_nan(self):
         _, values = align([(np.array([0.0]), np.array([1.0])), (np.empty(0), np.empty(0))])

@@ -93,6 +93,17 @@ class TestStrata:
         strata = [task * apart + normal((REPETITIONS, seeds), generator) for task in (-1, 0, 1)]
         assert holding(center_interval(strata, cut=cut), 0.0) > 0.93
 
+    @pytest.mark.parametrize("seeds", [2, 3, 5])
+    @pytest.mark.parametrize("spreads", [(0.5, 0.1, 2.0), (0.1, 0.02, 0.1)], ids=str)
+    def test_a_trimmed_mean_over_strata_that_spread_unequally_is_covered(self, seeds, spreads):
+        """However much is cut off: a stratum of which one value is left does not count as one without spread."""
+        generator = np.random.default_rng(seeds)
+        means, shape = (0.0, 1.0, 10.0), (REPETITIONS, seeds)
+        strata = [mean + each * normal(shape, generator) for mean, each in zip(means, spreads, strict=True)]
+        center = np.sort(np.concatenate(strata, -1), -1)
+        cut = int(0.25 * center.shape[-1])
+        assert holding(center_interval(strata, cut=0.25), center[:, cut:-cut].mean()) > 0.9
+
     def test_strata_with_different_means_do_not_widen_the_interval(self):
         low, high = center_interval([np.array([0.0, 0.1]), np.array([10.0, 10.1])])
         assert high - low < 1

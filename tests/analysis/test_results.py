@@ -71,7 +71,8 @@ class TestReading:
     def test_rows_that_a_resumed_run_logged_again_replace_the_earlier_ones(self, tmp_path):
         text = "frames,loss\n0,1\n10,2\n20,3\n30,4\n20,5\n30,6\n40,7\n"
         run = read_run(write(tmp_path / "run", text))
-        assert run.metrics["frames"].tolist() == [0, 10, 20, 20, 30, 40]
+        assert run.metrics["frames"].tolist() == [0, 10, 20, 30, 40]
+        assert run.metrics["loss"].tolist() == [1, 2, 5, 6, 7]
         assert [column.tolist() for column in curve(run, "loss")] == [[0, 10, 20, 30, 40], [1, 2, 5, 6, 7]]
 
     def test_summary_and_error_are_read(self, tmp_path):
@@ -129,6 +130,12 @@ class TestFindRuns:
     def test_folders_with_metrics_at_or_below_a_pattern(self, outputs, patterns, found):
         assert find_runs(patterns) == [Path("outputs") / name for name in found]
 
+    def test_a_run_and_links_to_it_are_one(self, outputs):
+        (outputs / "sweep" / "latest").symlink_to(outputs / "sweep" / "1-v2")
+        assert find_runs([f"{outputs}/sweep"]) == [outputs / "sweep/0-v1", outputs / "sweep/1-v2"]
+        assert find_runs(["outputs/sweep/0-v1", f"{outputs}/sweep/0-v1"]) == [outputs / "sweep/0-v1"]
+        assert find_runs([f"{outputs}/sweep/latest"]) == [outputs / "sweep/latest"]
+
     def test_runs_are_found_by_absolute_patterns(self, outputs):
         assert find_runs([f"{outputs}/sweep/**"]) == [outputs / "sweep/0-v1", outputs / "sweep/1-v2"]
 
@@ -153,7 +160,15 @@ class TestCurve:
     def test_flat_agents_have_no_intrinsic_reward(self, intrinsic, points):
         columns = {"greedy__intrinsic": [0, 0], "behaviour__return": [NAN, 1]}
         columns |= {} if intrinsic is None else {"behaviour__intrinsic": intrinsic}
-        assert len(curve(run_of(frames=[0, 1], **columns), "greedy/intrinsic")[0]) == points
+        run = run_of(frames=[0, 1], **columns)
+        assert len(curve(run, "greedy/intrinsic")[0]) == points
+        assert np.isnan(final_value(run, "greedy/intrinsic")) == (points == 0)
+
+    def test_evaluations_are_not_smoothed(self):
+        values = {"greedy__return": [0, NAN, 1, NAN, 5], "behaviour__return": [0, 1, 2, 0, 2]}
+        run = run_of(frames=[0, 1, 2, 3, 4], **values)
+        assert curve(run, "greedy/return", smooth=3)[1].tolist() == [0, 1, 5]
+        assert curve(run, "behaviour/return", smooth=3)[1].tolist() == [0.5, 1, 1, 4 / 3, 1]
 
     @pytest.mark.parametrize(
         ("window", "expected"),

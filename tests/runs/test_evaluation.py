@@ -309,6 +309,8 @@ class TestIntervals:
         played["in_order"] = torch.tensor([0.0, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5, 1.0])
         low, high = summarise(played)["intervals"]["in_order_rate"]
         assert (low, high) == pytest.approx((0.5 - 0.2235, 0.5 + 0.2235), abs=1e-4)  # t(7) = 2.365, s = 0.267 / sqrt 8
+        played["in_order"] = torch.tensor([0.5, *[1.0] * 7])
+        assert summarise(played)["intervals"]["in_order_rate"][1] == 1.0
 
     def test_a_rate_of_0_or_1_has_an_interval(self):
         """Between walls above and below nobody who goes up (0) moves."""
@@ -331,6 +333,25 @@ def test_observers_see_every_step_and_know_those_of_episodes_that_count():
     steps = Steps()
     played = play(pair_env(4), always_right(), episodes=40, observers=[steps])
     assert steps.seen > steps.counted == played["steps"].sum()  # who was lucky at once went on while the others played
+
+
+@pytest.mark.parametrize("levels", [2, 3])
+def test_options_that_an_evaluation_cuts_off_count_as_those_that_did_not_reach_their_subgoal(levels):
+    class Begun:
+        options = 0
+
+        def add_step(self, step, counted):
+            self.options += int((step[prefix + "option_init"].squeeze(-1) & counted).sum())
+
+    torch.manual_seed(0)
+    env, prefix = (small_env(16, max_steps=40), "") if levels == 2 else (house(16), "rooms_")
+    algorithm = build("v2", env, levels=levels)
+    legs, begun = LegCounter(2), Begun()
+    random = {"exploration_type": ExplorationType.RANDOM, "max_steps": 5}
+    played = play(algorithm.transform(env), algorithm.policy, episodes=16, observers=[legs, begun], **random)
+    assert played["cut_off"].sum() > 10
+    assert played[prefix + "chosen"].sum() == begun.options >= 16 > played[prefix + "reached"].sum()
+    assert legs.options.sum(0).tolist() == played["chosen"].sum(0).tolist()
 
 
 def test_legs_are_those_of_the_episodes_that_are_reported():

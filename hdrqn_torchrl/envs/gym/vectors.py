@@ -19,6 +19,11 @@ Mask = NDArray[np.bool_]
 _LARGEST_SEED = 2**31
 
 
+def _scattered(seed: int) -> int:
+    """A seed for makers of worlds that count on from it: those of neighbouring seeds would share all worlds but one."""
+    return int(np.random.default_rng(seed).integers(_LARGEST_SEED))
+
+
 class Outcome(NamedTuple):
     """What a step of N worlds returns, ``[N, ...]`` each."""
 
@@ -127,7 +132,7 @@ class GivenWorlds(_WithoutState):
 
     def seed(self, seed: int) -> None:
         """See :class:`Worlds`."""
-        self._seed, self._begun = seed, {}
+        self._seed, self._begun = _scattered(seed), {}
 
     def reset(self, mask: Mask) -> Entries:
         """See :class:`Worlds`."""
@@ -198,7 +203,7 @@ class PooledWorlds(_WithoutState):
         """See :class:`Worlds`. A pool takes a seed only when it is made."""
         if self.pool is not None:
             self.pool.close()
-        self.pool = self._make(seed % _LARGEST_SEED)
+        self.pool = self._make(_scattered(seed))
 
     def reset(self, mask: Mask) -> Entries:
         """See :class:`Worlds`."""

@@ -85,6 +85,17 @@ def test_the_same_seed_gives_the_same_worlds_and_another_seed_others():
     assert not torch.equal(first["observation"], other["observation"])
 
 
+def test_neighbouring_seeds_of_a_vector_made_elsewhere_share_no_worlds():
+    """Gymnasium gives world i the vector's seed plus i."""
+    env = make_gym(gymnasium.make_vec("CartPole-v1", num_envs=20, vectorization_mode="sync"), 20)
+
+    def starts(seed):
+        env.set_seed(seed)
+        return {tuple(row) for row in env.reset()["observation"].tolist()}
+
+    assert len(starts(4)) == 20 and starts(4) == starts(4) and not starts(4) & starts(5)
+
+
 def test_images_can_have_their_channels_at_either_end():
     def paint(env):
         space = gymnasium.spaces.Box(0, 255, (9, 8, 7), np.uint8)
