@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 
+from hdrqn_torchrl.analysis.figure_files import save_figure
 from hdrqn_torchrl.analysis.results import Run
-from hdrqn_torchrl.analysis.saving import save_figure
 
 
 def plot_legs(

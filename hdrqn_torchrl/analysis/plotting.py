@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from hdrqn_torchrl.analysis.figure_files import save_figure
 from hdrqn_torchrl.analysis.results import Metrics, References, read_metrics
-from hdrqn_torchrl.analysis.saving import save_figure
 
 __all__ = ["plot_run", "read_metrics"]
 

@@ -17,8 +17,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from numpy.typing import NDArray
 
 from hdrqn_torchrl.analysis.estimates import Center, Estimate, Group, TaskResults
+from hdrqn_torchrl.analysis.figure_files import save_figure
 from hdrqn_torchrl.analysis.results import Array, is_share
-from hdrqn_torchrl.analysis.saving import save_figure
 
 
 class Panel(NamedTuple):

@@ -7,9 +7,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from hdrqn_torchrl.analysis.estimates import write_table
+from hdrqn_torchrl.analysis.figure_files import save_figure
 from hdrqn_torchrl.analysis.figures import plot_places
 from hdrqn_torchrl.analysis.plotting import plot_run
-from hdrqn_torchrl.analysis.saving import save_figure
 
 
 @pytest.fixture
