@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import MISSING
 
 from hdrqn_torchrl.cli.command_line import check_place
+from hdrqn_torchrl.runs.persistence.files import replaced
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 if TYPE_CHECKING:
@@ -86,15 +87,11 @@ def record(settings: Settings) -> tuple[list[Frame], Agent]:
 
 
 def write(frames: list[Frame], path: Path, fps: int) -> None:
-    """Writes the file under another name first, so that it is whole or not there; prints how the episodes ended."""
+    """Writes a video that is whole or the one before; prints how the episodes ended."""
     from hdrqn_torchrl.rendering import write_video
 
-    partial = _partial(path)
-    try:
+    with replaced(path) as partial:
         write_video(frames, partial, fps=fps)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     for frame in frames:
         if frame.outcome:
             score = frame.score
@@ -103,19 +100,11 @@ def write(frames: list[Frame], path: Path, fps: int) -> None:
 
 
 def write_sheet(frames: list[Frame], path: Path, agent: Agent) -> None:
-    """Writes a picture of the agent's subgoals, as a whole or not at all."""
+    """Writes a picture of the agent's subgoals that is whole or the one before."""
     from PIL import Image
 
     from hdrqn_torchrl.rendering import draw_sheet, subgoal_records
 
-    partial = _partial(path)
-    try:
+    with replaced(path) as partial:
         Image.fromarray(draw_sheet(subgoal_records(frames), found=agent.algorithm.found)).save(partial)
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     print(f"{path}: {frames[-1].episode} episodes")
-
-
-def _partial(path: Path) -> Path:
-    return path.with_name(f".{path.name}.partial{path.suffix}")

@@ -160,7 +160,7 @@ class TestCurve:
     def test_flat_agents_have_no_intrinsic_reward(self, intrinsic, points):
         columns = {"greedy__intrinsic": [0, 0], "behaviour__return": [NAN, 1]}
         columns |= {} if intrinsic is None else {"behaviour__intrinsic": intrinsic}
-        run = run_of(frames=[0, 1], **columns)
+        run = run_of({"intrinsic_mean": 0.0}, frames=[0, 1], **columns)
         assert len(curve(run, "greedy/intrinsic")[0]) == points
         assert np.isnan(final_value(run, "greedy/intrinsic")) == (points == 0)
 
