@@ -24,7 +24,7 @@ from hdrqn_torchrl.data import (
     refresh_hidden,
     relabel_subgoals,
 )
-from hdrqn_torchrl.envs import Task
+from hdrqn_torchrl.envs import SubgoalSet, Task
 from hdrqn_torchrl.learning import Extract, Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.transforms import IntrinsicReward
@@ -119,7 +119,9 @@ class LevelBuilder:
         level, has = self.has.levels[0], self.has
         pursued, hindsight = _keys_above(level), self.sub_hindsight
         starts = [keys.IS_INIT] if settings.sampling in FROM_STARTS or has.event_keys else []
-        told: list[NestedKey] = [pursued.attained, *has.event_keys, *has.hazard_keys] if hindsight else []
+        above = has.levels[1].pursues
+        ends_above = [] if above is None else [above.keys.option_done, above.keys.option_terminated]
+        told = [pursued.attained, *has.event_keys, *has.hazard_keys, *ends_above] if hindsight else []
         limit = None if self.max_option_steps == 1 else self.max_option_steps  # of one step nothing would be left
         with settings_named(level.name):
             return Learner(
@@ -149,7 +151,7 @@ class LevelBuilder:
                 ),
                 num_envs=has.num_envs,
                 episode_len=has.task.max_steps,
-                refresh=self._relabel(pursued) if hindsight else None,
+                refresh=self._relabel(pursued, above) if hindsight else None,
                 refresh_reads=False,
             )
 
@@ -196,7 +198,9 @@ class LevelBuilder:
         """Steps of the longest options after which the state that a level reads is computed anew."""
         return self.refresh_hidden_steps if self.version == "v2" and index == 1 else None
 
-    def _relabel(self, pursued: keys.OptionKeys) -> Callable[[TensorDictBase], TensorDictBase]:
+    def _relabel(
+        self, pursued: keys.OptionKeys, above: SubgoalSet | None
+    ) -> Callable[[TensorDictBase], TensorDictBase]:
         return partial(
             relabel_subgoals,
             num_subgoals=self.has.levels[0].num_conditions,
@@ -208,6 +212,8 @@ class LevelBuilder:
             option_init_key=pursued.option_init,
             option_done_key=pursued.option_done,
             option_terminated_key=pursued.option_terminated,
+            upper_done_key=None if above is None else above.keys.option_done,
+            upper_terminated_key=None if above is None else above.keys.option_terminated,
             intrinsic_reward_key=pursued.intrinsic_reward,
         )
 

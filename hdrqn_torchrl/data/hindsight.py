@@ -33,6 +33,8 @@ def relabel_subgoals(
     option_init_key: NestedKey = keys.OPTION_INIT,
     option_done_key: NestedKey = keys.OPTION_DONE,
     option_terminated_key: NestedKey = keys.OPTION_TERMINATED,
+    upper_done_key: NestedKey | None = None,
+    upper_terminated_key: NestedKey | None = None,
     intrinsic_reward_key: NestedKey = keys.INTRINSIC_REWARD,
     eligible_key: NestedKey = keys.ELIGIBLE,
 ) -> TensorDictBase:
@@ -57,9 +59,11 @@ def relabel_subgoals(
         subgoal_key: subgoal in force.
         attained_key, hazard_key, option_done_key, option_terminated_key, intrinsic_reward_key: under ``"next"``;
             ``hazard_key=None``: no hazard.
+        upper_done_key, upper_terminated_key: the same of the option of the level above, under ``"next"``; ``None``:
+            there is none.
         mask_key, option_init_key: at the root, like the subgoal.
         eligible_key: written at the root, for :class:`~hdrqn_torchrl.objectives.RecurrentDQNLoss`; steps that are not
-            eligible in ``sample`` stay so.
+            eligible in ``sample``, the last that a step limit allows, stay so and end an option for g, too.
 
     Returns:
         ``[G * B, T]``, the sequences as they were first. An update costs accordingly more; a batch size of B / G costs
@@ -85,13 +89,17 @@ def relabel_subgoals(
     stays = left & torch.cat([left[:, 1:], torch.ones_like(left[:, :1])], 1)
     reached, eligible = attained.gather(-1, subgoal), left.gather(-1, subgoal)
     lost = eligible & ~stays.gather(-1, subgoal) & ~reached & ~after.get(keys.DONE)
-    ended, stayed = after.get(keys.TERMINATED), stays.gather(-1, pursued)
-    own = attained.gather(-1, pursued)  # what ends an option for the subgoal really pursued alone
-    dropped = left.gather(-1, pursued) & ~stayed & ~after.get(keys.DONE)
-    above = after.get(option_terminated_key) & ~own & ~dropped & ~ended  # the option of the level above ended
-    terminated = reached | lost | above | ended
-    cut = after.get(option_done_key) & ~own & stayed
-    done = terminated | cut | ~stays.gather(-1, subgoal) | after.get(keys.DONE)
+    own = attained.gather(-1, pursued) | ~stays.gather(-1, pursued)  # ends an option for the pursued subgoal alone
+    terminated = reached | lost | after.get(keys.TERMINATED)
+    cut = (after.get(option_done_key) & ~own) | after.get(keys.DONE)
+    if upper_terminated_key is not None:
+        terminated = terminated | after.get(upper_terminated_key)
+    if upper_done_key is not None:
+        cut = cut | after.get(upper_done_key)
+    before = told.get(eligible_key, None)
+    if before is not None:
+        cut = cut | ~before
+    done = terminated | cut | ~stays.gather(-1, subgoal)
     init = torch.cat([told.get(option_init_key)[:, :1], done[:, :-1]], 1)
     reward = rewards.of(attained, reached, None if hazard_key is None else after.get(hazard_key))
     for part, key, value in (
@@ -104,7 +112,6 @@ def relabel_subgoals(
     told.set(subgoal_key, subgoal.squeeze(-1))
     for key in state_keys:
         told.set(key, told.get(key).masked_fill(shift > 0, 0.0))
-    before = told.get(eligible_key, None)  # the last steps that options may have
     eligible = (shift == 0) | eligible
     return told.set(eligible_key, eligible if before is None else eligible & before)
 

@@ -14,7 +14,7 @@ top level pursues the task. For every level, every c and every choice x that agr
   is attained or lost;
 - an action agrees with a step if it was taken; a subgoal x agrees if the greedy choice of the level below for x does.
   x learns from the steps that it agrees with (intra-option learning; Sutton, Precup and Singh, 1998), and from those in
-  which it was pursued.
+  which it was pursued, where it can be chosen. Where no subgoal can be chosen any is, and all of them learn.
 
 So every level learns from every step, not only from those at which its options begin. Without intra-option learning,
 levels above the first learn only from the first step of each option, with the rewards of the whole option (SMDP):

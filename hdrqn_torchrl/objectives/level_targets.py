@@ -158,7 +158,9 @@ class LevelTargets:
             goes_on = target[:, 1:].gather(-1, active)  # stands in where the sequence breaks off within an option
             following = torch.where(tensordict[names.option_init][:, 1:].unsqueeze(-1), best, goes_on)
             trace = self._option_trace(rule, online, tensordict).unsqueeze(-1)
-        trained = (steps[names.subgoal_mask] & may_learn).unsqueeze(-2)
+        left = steps[names.subgoal_mask]
+        left = left | ~left.any(-1, keepdim=True)  # where none is left, any is chosen, and what they are worth is read
+        trained = (left & may_learn).unsqueeze(-2)
         shape = target[:, 1:].shape
         return self._finish(
             rule, following.expand(shape), trace.expand(shape), trained.expand(shape), tensordict, events

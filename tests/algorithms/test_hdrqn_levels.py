@@ -230,6 +230,21 @@ def test_hindsight_and_refreshed_states_work_at_the_lowest_levels():
     assert algorithm.learners["rooms"].replay.refresh is not None and algorithm.learners["meta"].replay.refresh is None
 
 
+@pytest.mark.parametrize("name", ["hdqn", "v1", "v2"])
+def test_in_hindsight_options_of_a_goal_end_those_of_every_room_even_where_they_attain_theirs(name):
+    algorithm, batch = played(name, sub_hindsight=True)
+    learner = algorithm.learners["sub"]
+    steps = learner.extract(batch)
+    over, pursued = steps["next", "option_done"], steps["rooms_subgoal"].unsqueeze(-1)
+    assert (steps["next", "option_terminated"] & ~steps["next", "terminated"]).sum() > 2
+    steps["next", "rooms_attained"] |= over & (torch.arange(steps["next", "rooms_attained"].shape[-1]) == pursued)
+    told = learner.replay.refresh(steps)["next"]
+    several = len(told) // len(over)
+    assert several > 1 and (told["rooms_option_done"] | ~over.repeat(several, 1, 1)).all()
+    terminated = steps["next", "option_terminated"].repeat(several, 1, 1)
+    assert (told["rooms_option_terminated"] | ~terminated).all()
+
+
 class Told(EpsilonGreedy):
     """Remembers where it is told that what it goes along with begins."""
 

@@ -31,8 +31,11 @@ def flags(text):
     return torch.tensor([[digit == "1" for digit in word] for word in text.split()])
 
 
-def sequence(*, pursued, attained, init, done, terminated="", episode_done="", mask, hazard="", reward):
-    """One sequence ``[1, T]`` of the sub level; flags are given as the numbers of the steps that have them."""
+def sequence(*, pursued, attained, init, done, terminated="", episode_done="", mask, hazard="", above="", reward):
+    """One sequence ``[1, T]`` of the sub level; flags are given as the numbers of the steps that have them.
+
+    ``above``: steps that terminate the option of the level above.
+    """
     time = len(pursued)
 
     def at(steps):
@@ -41,6 +44,7 @@ def sequence(*, pursued, attained, init, done, terminated="", episode_done="", m
     subgoal = torch.tensor([int(g) for g in pursued])[None]
     after = TensorDict(attained=flags(attained)[None], hazard=at(hazard), batch_size=[1, time])
     after.update({"option_done": at(done), "option_terminated": at(terminated), "done": at(episode_done)})
+    after.update({"above_done": at(above), "above_terminated": at(above)})
     after.update(
         {"terminated": at(episode_done) & at(terminated), "intrinsic_reward": torch.tensor(reward)[None, :, None]}
     )
@@ -136,7 +140,20 @@ class TestRelabelSubgoals:
             # The option of the level above terminated at step 1: that ends one for goal 1, too, which is worth nothing.
             (
                 {"pursued": "0000", "attained": "00 00 00 00", "mask": "11 11 11 11", "init": "02", "done": "1",
-                 "terminated": "1", "episode_done": "", "reward": [0.0, 0.0, 0.0, 0.0]},
+                 "terminated": "1", "above": "1", "reward": [0.0, 0.0, 0.0, 0.0]},
+                {"pursued": "1111", "reward": [0.0, 0.0, 0.0, 0.0], "init": "02", "done": "1", "terminated": "1",
+                 "eligible": "0123"},
+            ),
+            # It does so in the step that attains the pursued subgoal, or loses it.
+            (
+                {"pursued": "0000", "attained": "00 10 00 00", "mask": "11 11 11 11", "init": "02", "done": "1",
+                 "terminated": "1", "above": "1", "reward": [0.0, 1.0, 0.0, 0.0]},
+                {"pursued": "1111", "reward": [0.0, -0.5, 0.0, 0.0], "init": "02", "done": "1", "terminated": "1",
+                 "eligible": "0123"},
+            ),
+            (
+                {"pursued": "0011", "attained": "00 00 00 00", "mask": "11 11 01 01", "init": "02", "done": "1",
+                 "terminated": "1", "above": "1", "reward": [0.0, 0.0, 0.0, 0.0]},
                 {"pursued": "1111", "reward": [0.0, 0.0, 0.0, 0.0], "init": "02", "done": "1", "terminated": "1",
                  "eligible": "0123"},
             ),
@@ -158,7 +175,8 @@ class TestRelabelSubgoals:
     def test_a_sequence_is_relabelled_for_the_other_subgoal(self, played, told):
         sample = sequence(**played)
         before = sample.clone()
-        found = relabel_subgoals(sample, 2, rewards=IntrinsicReward(wrong_subgoal=-0.5))
+        upper = {"upper_done_key": "above_done", "upper_terminated_key": "above_terminated"}
+        found = relabel_subgoals(sample, 2, rewards=IntrinsicReward(wrong_subgoal=-0.5), **upper)
         assert found.shape == (2, len(played["pursued"]))
         as_it_was = {"terminated": "", **{key: played[key] for key in shown(found[0]) if key in played}}
         assert shown(found[0]) == as_it_was | {"eligible": "".join(map(str, range(len(played["pursued"]))))}
@@ -204,8 +222,16 @@ class TestRelabelSubgoals:
     def test_steps_that_must_not_be_trained_are_not_trained_for_other_subgoals_either(self):
         sample = sequence(**ON_THE_WAY)
         sample["eligible"] = torch.tensor([True, True, False, True]).view(1, 4, 1)
-        found = relabel_subgoals(sample, 2)["eligible"].squeeze(-1)
-        assert found.tolist() == [[True, True, False, True], [True, True, False, False]]
+        found = relabel_subgoals(sample, 2)
+        eligible = found["eligible"].squeeze(-1)
+        assert eligible.tolist() == [[True, True, False, True], [True, True, False, False]]
+
+    def test_a_step_limit_cuts_for_every_subgoal_even_where_one_is_attained(self):
+        sample = sequence(**BOTH_REACHED)
+        assert shown(relabel_subgoals(sample, 2)[1])["done"] == "4"
+        sample["eligible"] = torch.tensor([True, True, False, True, True]).view(1, 5, 1)
+        told = shown(relabel_subgoals(sample, 2)[1])
+        assert (told["init"], told["done"], told["terminated"]) == ("03", "24", "4")
 
     def test_a_single_subgoal_needs_no_relabelling(self):
         played = {"pursued": "00", "attained": "0 1", "mask": "1 1", "init": "0", "done": "1", "terminated": "1"}

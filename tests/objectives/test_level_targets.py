@@ -84,9 +84,9 @@ def play(loss, names, seed=0):
             for each in reversed(names):
                 starts[each] = fresh or above_starts or starts.get(each, True)
                 mask = [chance(0.8) for _ in range(SETS[each.prefix])]
-                mask = mask if any(mask) else [True] * len(mask)
+                mask = [False] * len(mask) if chance(0.1) else mask
                 if starts[each]:
-                    active[each] = pick([index for index, left in enumerate(mask) if left])
+                    active[each] = pick([index for index, left in enumerate(mask) if left or not any(mask)])
                 now[each.option_init], now[each.subgoal_mask] = starts[each], mask
                 now["next " + each.active_subgoal] = active[each]
                 now["next " + each.attained] = [chance(0.15) for _ in mask]
@@ -129,9 +129,11 @@ class Reference:
         return self.flag("done", b, t) and not self.flag("terminated", b, t)
 
     def allowed(self, level, b, t):
+        """Choices that there are; all, where there are none."""
         if level == 0:
             return self.td["action_mask"][b, t].nonzero().flatten().tolist() if self.masked else list(range(ACTIONS))
-        return self.td[self.names[level - 1].subgoal_mask][b, t].nonzero().flatten().tolist()
+        left = self.td[self.names[level - 1].subgoal_mask][b, t].nonzero().flatten().tolist()
+        return left or list(range(self.sizes[level]))
 
     def best(self, values, level, c, b, t):
         return max(self.allowed(level, b, t), key=lambda x: values[level][b * T + t, c, x].item())
