@@ -30,7 +30,7 @@ for episode in range(int(sys.argv[3])):
             inputs["available"] = ~reached  # subgoals that can be attained once in an episode
         outputs = dict(zip(names, session.run(None, inputs), strict=True))
         inputs |= {name: outputs["next_" + name] for name in about["state"]}  # this is all that it remembers
-        observation, reward, terminated, truncated, info = env.step(outputs["action"][0])
+        observation, reward, terminated, truncated, info = env.step(about["actions"][outputs["action"][0]])
         rewards.append(float(reward))
         done = terminated or truncated
     print(f"episode {episode}: return {sum(rewards):.2f} in {len(rewards)} steps")

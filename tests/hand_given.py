@@ -48,6 +48,7 @@ class ByHand:
 
     def __init__(self, *chosen: Chosen) -> None:
         self.chosen, self.asked, self.steps = chosen, 0, 0
+        self.taken_over: Chosen | None = None
 
     def observe(self, batch) -> None:
         self.steps += batch.numel()
@@ -55,6 +56,9 @@ class ByHand:
     def update(self) -> Chosen:
         self.asked += 1
         return self.chosen[min(self.asked, len(self.chosen)) - 1]
+
+    def take_over(self, chosen: Chosen) -> None:
+        self.taken_over = chosen
 
     def state_dict(self):
         return {"asked": self.asked, "steps": self.steps}

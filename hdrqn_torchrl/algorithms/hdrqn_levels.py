@@ -24,7 +24,7 @@ from hdrqn_torchrl.data import (
     refresh_hidden,
     relabel_subgoals,
 )
-from hdrqn_torchrl.envs import SubgoalSet, Task
+from hdrqn_torchrl.envs import Task
 from hdrqn_torchrl.learning import Extract, Learner, LearnerSettings
 from hdrqn_torchrl.modules import Architecture, EpsilonGreedy, MetaController, SubController
 from hdrqn_torchrl.transforms import IntrinsicReward
@@ -80,6 +80,7 @@ class LevelBuilder:
             init_key=pursued.option_init,
             mask_key=self.has.action_mask_key,
             option_keys=pursued,
+            upper_option_keys=self._pursued_above(0),
         )
 
     def upper_controller(self, index: int, exploration: EpsilonGreedy) -> MetaController:
@@ -110,6 +111,7 @@ class LevelBuilder:
             cell_key=cell_key,
             exploration_key=names.exploration,
             option_keys=above or keys.OptionKeys(),
+            upper_option_keys=self._pursued_above(index),
             return_key=names.option_return,
             steps_key=names.option_steps,
         )
@@ -119,8 +121,8 @@ class LevelBuilder:
         level, has = self.has.levels[0], self.has
         pursued, hindsight = _keys_above(level), self.sub_hindsight
         starts = [keys.IS_INIT] if settings.sampling in FROM_STARTS or has.event_keys else []
-        above = has.levels[1].pursues
-        ends_above = [] if above is None else [above.keys.option_done, above.keys.option_terminated]
+        above = self._pursued_above(0)
+        ends_above = [] if above is None else [above.option_done, above.option_terminated]
         told = [pursued.attained, *has.event_keys, *has.hazard_keys, *ends_above] if hindsight else []
         limit = None if self.max_option_steps == 1 else self.max_option_steps  # of one step nothing would be left
         with settings_named(level.name):
@@ -184,6 +186,11 @@ class LevelBuilder:
                 refresh=refresh,
             )
 
+    def _pursued_above(self, index: int) -> keys.OptionKeys | None:
+        """Of the set that the level above pursues; ``None`` if that is the task, or there is no level above."""
+        above = self.has.levels[index + 1 : index + 2]
+        return None if not above or above[0].pursues is None else above[0].pursues.keys
+
     def _is_masked(self, index: int) -> bool:
         """Whether a level chooses among what is left, or worth choosing, only."""
         chosen, is_top = self.has.subgoals[index - 1], index == len(self.has.subgoals)
@@ -199,7 +206,7 @@ class LevelBuilder:
         return self.refresh_hidden_steps if self.version == "v2" and index == 1 else None
 
     def _relabel(
-        self, pursued: keys.OptionKeys, above: SubgoalSet | None
+        self, pursued: keys.OptionKeys, above: keys.OptionKeys | None
     ) -> Callable[[TensorDictBase], TensorDictBase]:
         return partial(
             relabel_subgoals,
@@ -212,8 +219,8 @@ class LevelBuilder:
             option_init_key=pursued.option_init,
             option_done_key=pursued.option_done,
             option_terminated_key=pursued.option_terminated,
-            upper_done_key=None if above is None else above.keys.option_done,
-            upper_terminated_key=None if above is None else above.keys.option_terminated,
+            upper_done_key=None if above is None else above.option_done,
+            upper_terminated_key=None if above is None else above.option_terminated,
             intrinsic_reward_key=pursued.intrinsic_reward,
         )
 

@@ -74,7 +74,13 @@ class Requirements:
 
 
 def check_environment(
-    env: EnvBase, architecture: Architecture, *, builder: str, levels: int, discovered: SubgoalSet | None = None
+    env: EnvBase,
+    architecture: Architecture,
+    *,
+    builder: str,
+    levels: int,
+    discovered: SubgoalSet | None = None,
+    bonus: bool = False,
 ) -> Requirements:
     """Checks the specs of an environment and collects what a builder needs to know.
 
@@ -84,6 +90,7 @@ def check_environment(
         builder: name of the builder, for the error.
         levels: number of the agent's levels; it pursues the task's last ``levels - 1`` sets of subgoals.
         discovered: the set that the agent finds itself, and pursues in their place.
+        bonus: whether the agent is paid for the farthest set of subgoals without pursuing it.
 
     Raises:
         ValueError: with everything that is missing or wrong and what the environment has, or if the task has too few
@@ -112,6 +119,8 @@ def check_environment(
     entries.require_number(keys.REWARD)
     if levels > 1:
         entries.require_number(keys.EXTRINSIC_REWARD)
+    if bonus:
+        _subgoals(entries, task, 1)
     subgoals = _subgoals(entries, task, levels - 1) if discovered is None else (discovered,)
     available = _available(entries, subgoals) if discovered is None else (discovered.keys.available,)
     for key in (keys.HAZARD, keys.SUCCESS):

@@ -142,7 +142,9 @@ def make_v3(
         )
     finds = finds_subgoals(subgoals, levels=levels, phase_one=phase_one)
     own = discovered_set(discovery.max_subgoals) if finds else None
-    has = check_environment(env, architecture, builder="make_v3", levels=levels, discovered=own)
+    has = check_environment(
+        env, architecture, builder="make_v3", levels=levels, discovered=own, bonus=bool(bonus_reward)
+    )
     learner = with_sequences(learner.lasting(total_frames), has.task)
     turns = symmetries_of(has, learner) if symmetries else ()
     sub_exploration = sub_exploration or presets.v3_sub_exploration()

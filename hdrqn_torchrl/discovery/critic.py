@@ -109,7 +109,7 @@ class DiscoveredSubgoals(Transform):
     3. ``available`` ``[G]``: all that it has, but for those that an episode attains once and has attained; "explore"
        where there are no others. Such a subgoal that is found during an episode can be chosen from the next one on.
 
-    Copies share the critic: what is found in training holds in evaluations, too.
+    Copies share the critic: what is found in training holds in evaluations, too. (But copies of whole agents do not.)
 
     Args:
         critic: what events are, and which of them are subgoals. It is not a part of this module.
@@ -132,7 +132,7 @@ class DiscoveredSubgoals(Transform):
         self.__dict__["critic"] = critic
 
     def __deepcopy__(self, memo: dict[int, Any]) -> DiscoveredSubgoals:
-        return DiscoveredSubgoals(self.critic)
+        return DiscoveredSubgoals(memo.get(id(self.critic), self.critic))  # an agent's copy has a critic of its own
 
     def restated(self, task: Task) -> Task:
         """What is left of a task's statement: its subgoals are those that the agent finds, in no order."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import torch
@@ -109,16 +109,18 @@ class Occurrences:
         return times * _divergence(share, chance) * (share > chance), share
 
 
-def slots_attained_once(slots: Mapping[int, int], found: Occurrences) -> list[int]:
+def slots_attained_once(slots: Mapping[int, int], found: Occurrences, *, unseen: Collection[int] = ()) -> list[int]:
     """Slots of events that come a second time in fewer than 1 in 20 of their episodes, in ascending order.
 
     Args:
         slots: by token.
         found: events, those with a slot among them.
+        unseen: slots that count, too, as long as their events have not happened.
     """
-    seldom = (found.repeated * 20 < found.happened).tolist()
+    seldom, happened = (found.repeated * 20 < found.happened).tolist(), (found.happened > 0).tolist()
     once = {token for token, is_once in zip(found.events, seldom, strict=True) if is_once}
-    return sorted(slot for token, slot in slots.items() if token in once)
+    seen = {token for token, has in zip(found.events, happened, strict=True) if has}
+    return sorted(slot for token, slot in slots.items() if token in once or (slot in unseen and token not in seen))
 
 
 def _divergence(share: Tensor, chance: Tensor) -> Tensor:

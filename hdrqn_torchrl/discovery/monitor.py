@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.discovery.critic import EventCritic
 from hdrqn_torchrl.discovery.relabelling import relabel
-from hdrqn_torchrl.discovery.selection import Selection
+from hdrqn_torchrl.discovery.selection import Chosen, Selection
 from hdrqn_torchrl.discovery.settings import DiscoverySettings
 from hdrqn_torchrl.learning import Learner
 from hdrqn_torchrl.modules import SubgoalSuccess
@@ -27,8 +27,9 @@ class Discovery:
        (:func:`~hdrqn_torchrl.discovery.relabel`), so that new heads learn at once from all that was seen.
 
     A head whose slot gets another event is left as it is: it learns the new one from stored steps within a few hundred
-    updates, and what all heads have in common serves it, too. Options that pursued the old event can't be told anew:
-    where an agent learns from options, all memories begin empty then.
+    updates, and what all heads have in common serves it, too. Options can't be told anew: where an agent learns from
+    them, their memory begins empty with every new subgoal, which they could not have chosen, and that of steps does so
+    as well where a slot loses its event.
 
     Args:
         critic: of the agent.
@@ -71,7 +72,8 @@ class Discovery:
             return
         self.selection.observe(batch)
         interval, until = self.settings.discovery_frames, self.settings.until_frames
-        if self.frames // interval > before // interval and (until is None or self.frames <= until):
+        due = self.frames // interval * interval  # batches end somewhere behind it
+        if due > before and (until is None or due <= until):
             self._discover()
 
     def _teach(self, batch: TensorDictBase) -> None:
@@ -79,12 +81,7 @@ class Discovery:
         after = batch.get("next").get(keys.OBSERVATION)
         self.critic.detector.observe(batch.get(keys.OBSERVATION), batch.get(keys.ACTION), after)
         if self.critic.detector.ready:
-            self._forget()
-
-    def _forget(self) -> None:
-        for learner in (self.steps, *self.options):
-            learner.begin_empty()
-            learner.extract.reset()  # options wait there for the end of their episode
+            _forget(self.steps, *self.options)
 
     def _discover(self) -> None:
         table, chosen = self.critic.table, self.selection.update()
@@ -96,9 +93,17 @@ class Discovery:
         for success in self.successes:
             success.forget(~kept)
         if self.options and (in_use & ~kept).any():
-            self._forget()
+            _forget(self.steps)
         else:
             self.steps.rewrite(partial(relabel, table=table, kept=kept))
+        if ((in_use | table.in_use) & ~kept).any():
+            _forget(*self.options)
+
+    def take_over(self) -> None:
+        """Goes on with the subgoals that the critic has, as when it came with weights of another training."""
+        table = self.critic.table
+        slots = {token: slot for slot in range(table.num_subgoals) for token in table.tokens_of(slot)}
+        self.selection.take_over(Chosen(slots=slots, once=table.once.nonzero().flatten().tolist()))
 
     def metrics(self) -> dict[str, float]:
         """Number of subgoals, and when each was found (0: the slot is free)."""
@@ -117,3 +122,9 @@ class Discovery:
         """Restores what :meth:`state_dict` returned."""
         self.frames = state["frames"]
         self.selection.load_state_dict(state["selection"])
+
+
+def _forget(*learners: Learner) -> None:
+    for learner in learners:
+        learner.begin_empty()
+        learner.extract.reset()  # options wait there for the end of their episode

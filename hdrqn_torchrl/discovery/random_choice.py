@@ -48,6 +48,7 @@ class RandomSelection:
         self.slots: dict[int, int] = {}
         """Slot by token."""
         self._once: list[int] = []
+        self._given_once: list[int] = []  # slots whose events nothing was seen of yet
         self._record = EventRecord(num_tokens)
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -64,19 +65,27 @@ class RandomSelection:
     def _draw(self) -> None:
         history = self._record.history()
         tokens, counts = history.tokens[history.tokens > 0].unique(return_counts=True)
+        free = sorted(set(range(1, self.number + 1)) - set(self.slots.values()))
         others = [token for token in tokens[counts >= self.least].tolist() if token not in self.slots]
-        for place in torch.randperm(len(others))[: self.number - len(self.slots)].tolist():
-            self.slots[others[place]] = len(self.slots) + 1
-        self._once = slots_attained_once(self.slots, Occurrences(history, list(self.slots)))
+        for place, slot in zip(torch.randperm(len(others)).tolist(), free, strict=False):
+            self.slots[others[place]] = slot
+        own = Occurrences(history, list(self.slots))
+        self._once = slots_attained_once(self.slots, own, unseen=self._given_once)
+
+    def take_over(self, chosen: Chosen) -> None:
+        """Begins with subgoals that an agent has already; they keep their slots."""
+        self.slots, self._once, self._given_once = dict(chosen.slots), list(chosen.once), list(chosen.once)
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed training needs."""
-        return {**self._record.state_dict(), "slots": dict(self.slots), "once": list(self._once)}
+        own = {"slots": dict(self.slots), "once": list(self._once), "given_once": list(self._given_once)}
+        return {**self._record.state_dict(), **own}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._record.load_state_dict(state)
         self.slots, self._once = dict(state["slots"]), list(state["once"])
+        self._given_once = list(state.get("given_once", []))  # earlier versions had none
 
 
 class RandomChanges(nn.Module):

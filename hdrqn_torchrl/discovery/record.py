@@ -56,6 +56,9 @@ class EventRecord:
         self._kept += len(self._rows[-1])
         ends = after.get(keys.DONE).squeeze(-1)
         self._ends.append(torch.stack([worlds[ends], steps[ends]], -1).cpu())
+        if self._clock and (init := batch.get(keys.IS_INIT, None)) is not None:
+            began = init[:, 0].squeeze(-1)  # what was in progress there before, if anything, was lost between batches
+            self._ends.append(torch.stack([worlds[began, 0], steps[began, 0] - 1], -1).cpu())
         self._worlds = max(self._worlds, action.shape[0])
         self._clock += action.shape[1]
         if self._kept > 2 * _ROWS:

@@ -26,6 +26,9 @@ class Selection(Protocol):
     def update(self) -> Chosen:
         """Looks for subgoals, at discovery points alone."""
 
+    def take_over(self, chosen: Chosen) -> None:
+        """Begins with subgoals that an agent has already; they keep their slots."""
+
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed training needs."""
 

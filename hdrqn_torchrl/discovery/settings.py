@@ -77,7 +77,8 @@ class DiscoverySettings:
         Raises:
             ValueError: if ``choice`` is ``"random_changes"`` and the observation has no cells of codes.
         """
-        table, number = SubgoalTable(self.max_subgoals), self.random_subgoals or self.max_subgoals
+        table = SubgoalTable(self.max_subgoals, max_tokens=max(256, self.max_subgoals))
+        number = self.random_subgoals or self.max_subgoals
         if self.choice == "random_changes":
             dims, sizes = len(observation.shape) - 1, sizes_of(observation)
             changes = RandomChanges(sizes, number=number, num_dims=dims, warmup_frames=self.warmup_frames)

@@ -105,13 +105,15 @@ def _save_onnx(
 
 
 def describe(step: DecisionStep) -> dict[str, Any]:
-    """What another program needs to know: which inputs are the state, and what subgoals are called."""
+    """What another program needs to know: the inputs, which of them are the state, the task's numbers of the actions,
+    what subgoals are called."""
     names = {level.choice_key: list(level.choice_names) for level in step.levels if level.init_key is not None}
     return {
         "version": __version__,
         "observed": [name_of(key) for key in step.observed],
         "state": [part.name for part in step.carried],
         "next": NEXT,
+        "actions": list(step.action_numbers),
         "subgoals": {part.name: names[part.after] for part in step.carried if part.after in names},
     }
 

@@ -99,6 +99,10 @@ class DecisionStep(nn.Module):
         read = [keys.OBSERVATION, keys.IS_INIT, *_read_by(self._books), *self.policy.in_keys]
         self.observed: list[NestedKey] = [key for key in dict.fromkeys(read) if key not in written]
         """What the environment shows: entries of what follows a step, or of a reset."""
+        self.action_numbers: tuple[int, ...] = getattr(
+            env, "action_numbers", tuple(range(env.full_action_spec[keys.ACTION].n))
+        )
+        """The task's own number of each action, where an agent has only some of them."""
         fake = env.fake_tensordict()
         self._like = {key: fake.get(key)[:1] for key in fake.exclude("next").keys(True, True)}
         self._like |= {key: fake.get(("next", key))[:1] for key in fake.get("next").keys(True, True)}

@@ -59,6 +59,7 @@ class Phases:
         explorations: the upper levels'; they must start at epsilon 1 to choose at random. The meta level's is the last.
         learners: the upper levels', where they have their own.
         names: entries of the set that the sub level pursues.
+        upper_names: those of the set that the level above pursues; ``None``: it pursues the task.
 
     Raises:
         ValueError: if an upper level would not choose at random.
@@ -84,6 +85,7 @@ class Phases:
         learners: Sequence[Learner],
         *,
         names: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
+        upper_names: OptionKeys | None = None,
     ) -> None:
         for name, each in zip([*["middle"] * (len(explorations) - 1), "meta"], explorations, strict=True):
             if each.start != 1.0:
@@ -94,7 +96,7 @@ class Phases:
                     "success; use EpsilonGreedy."
                 )
         self.settings, self.explorations, self.learners = settings, explorations, learners
-        success = SubgoalSuccess(num_subgoals, window=settings.window, names=names)
+        success = SubgoalSuccess(num_subgoals, window=settings.window, names=names, upper_names=upper_names)
         self.success = success.to(explorations[-1].epsilon.device)
         self.frames = 0
         self._hold(True)
@@ -163,9 +165,10 @@ def phase_monitors(
     """
     if settings is None:
         return {}
-    near = subgoals[0]
+    near, *farther = subgoals
+    upper_names = farther[0].keys if farther else None
     return {
-        "phases": Phases(settings, len(near), explorations, learners, names=near.keys),
+        "phases": Phases(settings, len(near), explorations, learners, names=near.keys, upper_names=upper_names),
         **{each.keys.of("legs"): LegCounter(len(each), names=each.keys) for each in subgoals},
         "visits": VisitCounter(),
     }

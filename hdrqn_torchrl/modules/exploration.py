@@ -96,12 +96,13 @@ class EpsilonGreedy(nn.Module):
         progress = (self.frames / self.anneal_frames).clamp(max=1.0)
         self.epsilon.copy_(self.start + (self.end - self.start) * progress)
 
-    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys) -> None:
+    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys, upper_names: OptionKeys | None = None) -> None:
         """Tells among how many subgoals the pursued one is; here they make no difference.
 
         Args:
             num_subgoals: G.
             names: of the entries that hold their outcome.
+            upper_names: of those of the level above, whose options end these; ``None``: there is none.
         """
 
     def observe(self, batch: TensorDictBase) -> None:

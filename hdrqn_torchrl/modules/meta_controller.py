@@ -49,6 +49,7 @@ class MetaController(TensorDictModuleBase):
         exploration_key: what the exploration carries from option to option, if anything.
         option_keys: entries of the options of the level above: where they end, and what became of them, on which
             ``exploration`` may depend.
+        upper_option_keys: those of the level above that one, whose options end these; ``None``: there is none.
         return_key, steps_key: what its own options earned, and how long they took; read in learning.
 
     Raises:
@@ -84,6 +85,7 @@ class MetaController(TensorDictModuleBase):
         cell_key: NestedKey = keys.META_CELL,
         exploration_key: NestedKey = keys.SUBGOAL_EXPLORATION,
         option_keys: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
+        upper_option_keys: OptionKeys | None = None,
         return_key: NestedKey = keys.OPTION_RETURN,
         steps_key: NestedKey = keys.OPTION_STEPS,
     ) -> None:
@@ -102,7 +104,7 @@ class MetaController(TensorDictModuleBase):
         if condition_key is None:
             check_condition(self.exploration, "exploration")
         else:
-            self.exploration.set_num_subgoals(network.num_conditions, names=option_keys)
+            self.exploration.set_num_subgoals(network.num_conditions, names=option_keys, upper_names=upper_option_keys)
         check_chooses_subgoals(self.exploration, "exploration")
         self.input_keys, self.mask_key, self.subgoal_key = list(input_keys), mask_key, subgoal_key
         self.condition_key, self.init_key = condition_key, init_key

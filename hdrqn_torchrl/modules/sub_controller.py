@@ -43,6 +43,8 @@ class SubController(TensorDictModuleBase):
         mask_key: actions that can be chosen ``[A]`` bool; ``None``: all of them.
         option_keys: entries of the options that it pursues: what they are paid, where they end, and what became of
             them, on which ``exploration`` may depend.
+        upper_option_keys: those of the options that the level above pursues, which end these; ``None``: it pursues the
+            task.
 
     Raises:
         ValueError: if network or ``exploration`` do not fit a flat or hierarchical agent.
@@ -75,6 +77,7 @@ class SubController(TensorDictModuleBase):
         exploration_key: NestedKey = keys.ACTION_EXPLORATION,
         mask_key: NestedKey | None = None,
         option_keys: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
+        upper_option_keys: OptionKeys | None = None,
     ) -> None:
         super().__init__()
         if (subgoal_key is None) != (network.num_conditions == 0):
@@ -86,7 +89,7 @@ class SubController(TensorDictModuleBase):
         if subgoal_key is None:
             check_condition(self.exploration, "exploration")
         else:
-            self.exploration.set_num_subgoals(network.num_conditions, names=option_keys)
+            self.exploration.set_num_subgoals(network.num_conditions, names=option_keys, upper_names=upper_option_keys)
         self.observation_key, self.subgoal_key, self.init_key = observation_key, subgoal_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
         self.hidden_key, self.cell_key, self.exploration_key = hidden_key, cell_key, exploration_key

@@ -7,7 +7,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.functional import one_hot
 
-from hdrqn_torchrl.keys import OptionKeys
+from hdrqn_torchrl.keys import DONE, OptionKeys
 from hdrqn_torchrl.modules.repeating import RepeatingEpsilonGreedy
 from hdrqn_torchrl.modules.sizes import check_size
 
@@ -15,12 +15,14 @@ from hdrqn_torchrl.modules.sizes import check_size
 class SubgoalSuccess(nn.Module):
     """Share of the options for each subgoal that reached it: a moving average over the last ones.
 
-    Options for a subgoal that could not be chosen to begin with do not count.
+    Options for a subgoal that could not be chosen to begin with do not count, nor those that ended before they reached
+    it because the option of the level above did, while the episode goes on.
 
     Args:
         num_subgoals: G.
         window: number of options that the average goes over, or all of them while there are fewer.
         names: entries of the set of subgoals, which :class:`~hdrqn_torchrl.transforms.SubgoalTransform` writes.
+        upper_names: those of the set that the level above pursues; ``None``: there is none.
 
     Raises:
         ValueError: if a number is not positive.
@@ -46,6 +48,7 @@ class SubgoalSuccess(nn.Module):
         *,
         window: int = 100,
         names: OptionKeys = OptionKeys(),  # noqa: B008 (frozen)
+        upper_names: OptionKeys | None = None,
     ) -> None:
         super().__init__()
         for name, value, usual in (("num_subgoals", num_subgoals, 6), ("window", window, 100)):
@@ -53,12 +56,15 @@ class SubgoalSuccess(nn.Module):
         self.window = window
         after = (names.active_subgoal, names.option_done, names.subgoal_reached)
         self._keys = [names.subgoal_mask, *(("next", key) for key in after)]
+        self._upper_done_key = None if upper_names is None else ("next", upper_names.option_done)
         self.register_buffer("rates", torch.zeros(num_subgoals))
         self.register_buffer("options", torch.zeros(num_subgoals, dtype=torch.int64))
 
     def observe(self, batch: TensorDictBase) -> None:
         """Counts the options that ended in a collected batch ``[N, T]``; they are all equally recent."""
         could, subgoal, done, reached = (batch.get(key) for key in self._keys)
+        if self._upper_done_key is not None:
+            done = done & (reached | batch.get(("next", DONE)) | ~batch.get(self._upper_done_key))
         pursued = one_hot(subgoal, len(self.rates)) * (done & could).long()  # [N, T, G]
         ended, won = pursued.flatten(0, -2).sum(0), (pursued * reached.long()).flatten(0, -2).sum(0)
         self.options += ended
@@ -117,9 +123,9 @@ class SuccessEpsilonGreedy(RepeatingEpsilonGreedy):
         check_size("window", window, 100)
         self.window = window
 
-    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys) -> None:
+    def set_num_subgoals(self, num_subgoals: int, *, names: OptionKeys, upper_names: OptionKeys | None = None) -> None:
         """Must be called before it chooses; the policies that explore with it do."""
-        self.success = SubgoalSuccess(num_subgoals, window=self.window, names=names)
+        self.success = SubgoalSuccess(num_subgoals, window=self.window, names=names, upper_names=upper_names)
 
     def observe(self, batch: TensorDictBase) -> None:
         """Learns from a collected batch how often subgoals were reached."""

@@ -1,5 +1,6 @@
 """v3 with subgoals=discovered: what it reads, what it refuses, and what its weights hold."""
 
+from copy import deepcopy
 from dataclasses import replace
 
 import pytest
@@ -10,6 +11,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import ExcludeTransform
 
 from hdrqn_torchrl.algorithms import make_hdrqn, make_v3
+from hdrqn_torchrl.discovery import Chosen, DiscoveredSubgoals
 from hdrqn_torchrl.learning import PhaseOne
 from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.runs.evaluation import evaluate
@@ -89,8 +91,16 @@ def test_a_training_that_starts_from_weights_has_their_subgoals():
     start_from(other, agent.policy.state_dict())
     assert list(other.levels[-1].choice_names) == list(agent.levels[-1].choice_names)
     without = {name: value for name, value in agent.policy.state_dict().items() if not name.startswith("critic")}
+    assert other.monitors["discovery"].selection.taken_over == Chosen({1: 1, 2: 2}, once=[1, 2])
     with pytest.raises(ValueError, match=r"init_from must .* critic\..* is missing there"):
         start_from(other, without)
+
+
+def test_a_copy_of_an_agent_has_a_critic_of_its_own_in_its_worlds_too():
+    agent = make_agent(small_env())
+    twin = deepcopy(agent)
+    (used,) = (each.critic for each in twin.transform(small_env()).transform if isinstance(each, DiscoveredSubgoals))
+    assert used is twin.policy.critic is twin.monitors["discovery"].critic is not agent.policy.critic
 
 
 def test_the_book_takes_only_subgoals_that_are_available():

@@ -43,6 +43,13 @@ def test_subgoals_are_looked_for_every_discovery_frames_until_until_frames():
     assert asked == [0, 1, 1, 2, 3, 3, 3, 3]  # where 50, 100 and 150 frames were passed
 
 
+def test_the_look_that_is_due_at_until_frames_is_taken_though_the_batch_ends_later():
+    agent, batches = agent_and_batches(6, discovery_frames=50, until_frames=100)
+    for batch in batches:
+        agent.observe(batch)
+    assert agent.monitors["discovery"].selection.asked == 2
+
+
 def test_stored_steps_are_told_anew_and_minibatches_drawn_before_are_forgotten():
     agent, batches = agent_and_batches(4, chosen=(Chosen({}), BOTH_GOALS))
     learner = agent.learners["joint"]
@@ -65,12 +72,13 @@ def test_v2_relabels_steps_and_forgets_options_whose_subgoal_has_another_meaning
         agent.observe(batch)
         for name, learner in agent.learners.items():
             stored[name].append(len(learner.buffer))
-            if len(stored["sub"]) == 4:  # the second goal is new
+            if len(stored["sub"]) == 4:  # the second goal is new: options could not choose it
+                assert not len(agent.learners["meta"].buffer)
                 steps = agent.learners["sub"].buffer.storage[:]
                 assert torch.equal(steps["next", "attained"].any(-1), (steps["next", "events"] > 0).any(-1))
                 assert steps["subgoal_mask"][..., 2].any()
     assert [rows // FRAMES for rows in stored["sub"]] == [0, 1, 2, 3, 4, 0]  # the first batch taught the detector
-    assert stored["meta"][0] == stored["meta"][5] == 0 < stored["meta"][4]
+    assert all(bool(rows) == has for rows, has in zip(stored["meta"], [0, 0, 1, 0, 1, 0], strict=True))
 
 
 @pytest.mark.parametrize("name", ["v2", "v3"])

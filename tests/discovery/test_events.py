@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from hdrqn_torchrl.discovery import ChangeDetector, EventSelection
+from hdrqn_torchrl.discovery import ChangeDetector, Chosen, EventSelection, RandomSelection
 from hdrqn_torchrl.discovery.control import Control
 from hdrqn_torchrl.discovery.history import History, Occurrences, events_of
 from hdrqn_torchrl.discovery.record import EventRecord
@@ -69,6 +69,20 @@ def test_a_slot_stays_attained_once_when_its_event_has_become_part_of_another():
     assert chosen.slots == {SHADE: 1, KEY: 2} and chosen.once == [1, 2]
 
 
+@pytest.mark.parametrize("make", [make_selection, lambda **_: RandomSelection(5, number=4)])
+def test_subgoals_that_were_taken_over_keep_their_slots_and_what_is_known_of_them(make):
+    selection = make(max_subgoals=4)
+    selection.take_over(Chosen({KEY: 3, SHADE: 2}, once=[3, 2]))
+    selection.observe(episodes(*[CHAIN] * 6, *[[(3, KEY, DO, 0.0), (9, KEY, DO, 0.0)]] * 6))
+    chosen = selection.update()
+    assert {token: chosen.slots[token] for token in (KEY, SHADE)} == {KEY: 3, SHADE: 2}
+    assert sorted(chosen.slots.values()) == list(range(1, len(chosen.slots) + 1)) and len(chosen.slots) == 4
+    assert 2 in chosen.once and 3 not in chosen.once  # nothing was seen of the one; the other came again
+    other = make(max_subgoals=4)
+    other.load_state_dict(selection.state_dict())
+    assert other.update() == chosen
+
+
 def test_what_costs_is_no_subgoal():
     hazard = torch.zeros(6, T, 1, dtype=torch.bool)
     hazard[:, 4] = True
@@ -105,6 +119,17 @@ def test_evidence_is_the_likelihood_ratio_against_chance():
     assert evidence[0].item() == pytest.approx(2 * math.log((4 * T + 1) / (2 * 16 + 1)))
     given, _ = found.evidence(1, [0])
     assert given[0].item() == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_episode_that_was_lost_between_two_batches_is_one_of_its_own():
+    record, (batch,) = EventRecord(5), episodes([(3, KEY, DO, 0.0)]).split(1)
+    batch["next", "done"][:] = False
+    record.add(batch.set("is_init", torch.zeros(1, T, 1, dtype=torch.bool)))
+    again = batch.clone()
+    again["is_init"][:, 0] = True
+    record.add(again)
+    assert record.history().lengths.tolist() == [T, T]
+    assert Occurrences(record.history(), [KEY]).repeated.tolist() == [0]
 
 
 def test_episodes_go_on_from_batch_to_batch():

@@ -5,7 +5,9 @@ import json
 import pytest
 import torch
 from exported_agents import KINDS, make_agent
+from helpers import build
 
+from hdrqn_torchrl.envs import make_gym
 from hdrqn_torchrl.export import DecisionStep, agreement_with, check_file, export_step, files, load_step
 
 PACKAGES = ("onnx", "onnxscript", "onnxruntime")
@@ -48,6 +50,14 @@ def test_a_file_says_what_its_inputs_are():
     assert about["observed"] == ["observation", "is_init", "attained", "rooms_attained", "rooms_available"]
     assert {"active_subgoal", "rooms_subgoal_mask", "memory_cell", "previous_action"} < set(about["state"])
     assert about["subgoals"]["active_subgoal"] == ["goal 1", "goal 2"] and len(about["subgoals"]) == 2
+
+
+def test_a_file_says_which_actions_of_the_task_its_numbers_are():
+    some = make_gym("FrozenLake-v1", num_envs=2, actions=[3, 2], seed=0)
+    algorithm = build("drqn", some)
+    assert files.describe(DecisionStep(algorithm, algorithm.transform(some)))["actions"] == [3, 2]
+    algorithm, env = make_agent("v2", 2)
+    assert files.describe(DecisionStep(algorithm, env))["actions"] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("name", ["agent", "agent.pt", "agent.ONNX.zip"])

@@ -46,6 +46,16 @@ class TestSubgoalSuccess:
         success.observe(steps)
         assert success.rates.tolist() == [1.0, 1.0] and success.options.tolist() == [1, 1]
 
+    def test_options_that_only_the_end_of_a_farther_one_cut_off_do_not_count(self):
+        success, steps = SubgoalSuccess(1, upper_names=OptionKeys("far")), batch(WON, LOST, LOST, GOES_ON)
+        steps["next", "far_option_done"] = torch.tensor([True, True, False, True]).view(1, 4, 1)
+        steps["next", "done"] = torch.zeros(1, 4, 1, dtype=torch.bool)
+        success.observe(steps)
+        assert success.rates.tolist() == [0.5] and success.options.tolist() == [2]
+        steps["next", "done"][0, 1] = True  # the end of an episode is a failure
+        success.observe(steps)
+        assert success.options.tolist() == [5]
+
     def test_a_subgoal_that_means_something_else_begins_again(self):
         success = SubgoalSuccess(2, window=10)
         success.observe(batch(WON, WON, (1, True, True), num_subgoals=2))

@@ -86,8 +86,7 @@ class GymTaskEnv(EnvBase):
             self._entries = {key: value.copy() for key, value in begun.items()}
         for key, value in self._entries.items():
             value[chosen] = begun[key][chosen]
-            if key.endswith(keys.ATTAINED) or key in (keys.SUCCESS, keys.HAZARD):
-                value[:] = False  # of the step before
+        self._forget_outcome()
         self._lost = False
         no = np.zeros(self.num_worlds, np.bool_)
         return self._tensordict({**self._entries, keys.DONE: no, keys.TERMINATED: no, keys.TRUNCATED: no})
@@ -113,8 +112,20 @@ class GymTaskEnv(EnvBase):
         """A step in which nothing happens but the end, as by a time limit, of episodes that are lost."""
         no, nothing = np.zeros(self.num_worlds, np.bool_), np.zeros(self.num_worlds, np.float32)
         yes = ~no
+        self._forget_outcome()
         ends = {keys.DONE: yes, keys.TERMINATED: no, keys.TRUNCATED: yes}
         return self._tensordict({**self._entries, keys.REWARD: nothing, keys.EXTRINSIC_REWARD: nothing, **ends})
+
+    def _forget_outcome(self) -> None:
+        """What the step before attained, met and completed does not happen again."""
+        for key, value in self._entries.items():
+            if key.endswith(keys.ATTAINED) or key in (keys.SUCCESS, keys.HAZARD):
+                value[:] = False
+
+    @property
+    def action_numbers(self) -> tuple[int, ...]:
+        """The environment's number of each action."""
+        return tuple(self._actions.tolist())
 
     @property
     def num_worlds(self) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import current_process
 from typing import Any, Literal
 
 import gymnasium
@@ -106,6 +107,11 @@ def make_gym(
         >>> env.rollout(3)["observation"].shape
         torch.Size([4, 3, 4])
     """
+    if processes and current_process().daemon:
+        raise ValueError(
+            "processes must be False in a worker of collector=processes, got True: it is a process itself and can't "
+            "have others; raise collector.workers instead."
+        )
     check_given(
         id, num_envs, settings=settings, package=package, wrappers=wrappers, actions=actions, max_steps=max_steps
     )

@@ -182,6 +182,11 @@ class MontezumaEnv(EnvBase):
         if self.noops and (number := int(self._generator.integers(self.noops + 1))):
             self.emulators.act_alone(index, 0, number)
 
+    @property
+    def action_numbers(self) -> tuple[int, ...]:
+        """ALE's number of each action."""
+        return self.actions
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         had_key = self.ram.has_key()
         chosen = tensordict.get(keys.ACTION).tolist()

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.checkpoint import CheckpointError
 
 from hdrqn_torchrl.algorithms import Algorithm
+from hdrqn_torchrl.discovery import Discovery
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.persistence.checkpoint import Checkpoints
 from hdrqn_torchrl.runs.persistence.weights import read_weights
@@ -106,6 +107,9 @@ def start_from(algorithm: Algorithm, weights: Weights) -> None:
         parameter.copy_(found[name])
     for learner in algorithm.learners.values():
         learner.copy_to_target()
+    for monitor in algorithm.monitors.values():
+        if isinstance(monitor, Discovery):
+            monitor.take_over()
 
 
 def _is_of_exploration(name: str) -> bool:

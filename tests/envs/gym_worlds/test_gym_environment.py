@@ -1,3 +1,5 @@
+from multiprocessing import current_process
+
 import gymnasium
 import numpy as np
 import pytest
@@ -235,6 +237,19 @@ class TestState:
         assert step["next", "truncated"][:, 0].all() and not step["next", "reward"][:, 0].any()
         assert not step["next", "truncated"][:, 1].any()
 
+    def test_the_step_that_cuts_them_off_attains_nothing_again(self):
+        outcome = ("attained", "success", "hazard")
+        always = {"success": lambda reward, info: True, "hazard": lambda reward, info: True}
+        env = make_gym(Forgetful, 2, seed=0, subgoals=Milestones(), **always)
+        step = go_on(env, env.reset(), 3)[:, -1]["next"]
+        state = env.state_dict()
+        for key in outcome:
+            state["entries"][key][:] = True
+        with pytest.warns(UserWarning, match="could not be brought back"):
+            env.load_state_dict(state)
+        cut = env.step(step.select("observation").set("action", torch.zeros(2).long()))["next"]
+        assert cut["truncated"].all() and not any(cut[key].any() for key in outcome)
+
     def test_an_episode_of_too_many_actions_is_cut_off_and_the_next_one_is_brought_back(self, monkeypatch):
         monkeypatch.setattr(worlds, "MOST_ACTIONS", 5)
         env = make_gym(lambda: Counter(ends=False), 2, seed=0)
@@ -314,6 +329,12 @@ class TestState:
 def test_what_cannot_be_made_is_refused(id, settings, words):
     with pytest.raises((ValueError, ImportError), match=words):
         make_gym(id, **settings)
+
+
+def test_worlds_in_processes_of_their_own_are_refused_where_there_can_be_none(monkeypatch):
+    monkeypatch.setitem(current_process()._config, "daemon", True)  # as in a worker
+    with pytest.raises(ValueError, match="processes must be False in a worker of collector=processes, got True"):
+        make_gym("CartPole-v1", 2, processes=True)
 
 
 class Stating(Counter):
