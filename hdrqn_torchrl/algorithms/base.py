@@ -113,6 +113,20 @@ def _copy(transforms: Sequence[Transform]) -> Compose:
     return Compose(*deepcopy(transforms))
 
 
+def check_learners(**given: object) -> None:
+    """Refuses settings of learners, by the name of their argument, that are something else; ``None`` is none of them.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    for name, each in given.items():
+        if each is not None and not isinstance(each, LearnerSettings):
+            raise ValueError(
+                f"{name} must be LearnerSettings, got {each!r}; dataclasses.replace changes some of others, "
+                "for instance replace(V3_LEARNER, batch_size=16)."
+            )
+
+
 @contextmanager
 def settings_named(name: str) -> Iterator[None]:
     """Puts the name of the argument before errors about fields of its :class:`LearnerSettings`."""

@@ -7,7 +7,14 @@ from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import presets
-from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, make_recurrent_loss, settings_named, stored_states
+from hdrqn_torchrl.algorithms.base import (
+    Algorithm,
+    check_learners,
+    copies_of,
+    make_recurrent_loss,
+    settings_named,
+    stored_states,
+)
 from hdrqn_torchrl.algorithms.requirements import check_environment
 from hdrqn_torchrl.algorithms.views import views_of
 from hdrqn_torchrl.data import StepSelector
@@ -50,6 +57,7 @@ def make_drqn(
         >>> list(make_drqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['flat']
     """
+    check_learners(learner=learner)
     learner, exploration = learner.lasting(total_frames), exploration or presets.flat_exploration()
     has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", levels=1)
     network = architecture.q_network(

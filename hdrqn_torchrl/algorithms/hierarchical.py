@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl.algorithms import presets
-from hdrqn_torchrl.algorithms.base import Algorithm, copies_of
+from hdrqn_torchrl.algorithms.base import Algorithm, check_learners, copies_of
 from hdrqn_torchrl.algorithms.books import make_books
 from hdrqn_torchrl.algorithms.discovering import finding_subgoals, finds_subgoals
 from hdrqn_torchrl.algorithms.hdrqn_levels import LevelBuilder
@@ -117,6 +117,7 @@ def make_hdrqn(
         ['sub', 'meta']
     """
     _check_version(version, recurrent, meta_input, meta_input_time, refresh_hidden_steps)
+    check_learners(sub=sub, meta=meta, middle=middle)
     meta = (meta or presets.meta_learner(version)).lasting(total_frames)
     sub, middle = sub.lasting(total_frames), (middle or meta).lasting(total_frames)
     _check_levels(levels, meta_hindsight, meta_input_time)

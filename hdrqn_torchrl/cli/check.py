@@ -21,6 +21,7 @@ from omegaconf import open_dict
 
 from hdrqn_torchrl.cli.command_line import overrides_last, results_alone
 from hdrqn_torchrl.cli.configuration import CONF, resolved
+from hdrqn_torchrl.cli.misspelt import misspelt
 from hdrqn_torchrl.runs.settings.arguments import SettingsError, remedy
 from hdrqn_torchrl.runs.settings.building import build, build_env
 from hdrqn_torchrl.runs.settings.commands import as_called, command_of
@@ -64,7 +65,8 @@ def composed(arguments: list[str]) -> RunSettings:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             config = compose("config", overrides=overrides, return_hydra_config=True)
     except HydraException as error:
-        raise SettingsError(f"{str(error).splitlines()[0].rstrip('.')}; {remedy()}.") from error
+        told = [each.removeprefix("error: ") for each in misspelt(arguments)]
+        raise SettingsError(" ".join(told) or f"{str(error).splitlines()[0].rstrip('.')}; {remedy()}.") from error
     with open_dict(config):
         del config["hydra"]
     settings = resolved(config)

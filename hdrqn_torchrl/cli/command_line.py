@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from dataclasses import fields, replace
@@ -40,6 +41,21 @@ def check_place(path: Path, key: str) -> None:
             raise IsADirectoryError("it is a folder")
     except OSError as error:
         raise SettingsError(f"{key} must be a file that can be written, got {str(path)!r} ({error}).") from error
+
+
+def check_folder(path: Path, key: str) -> None:
+    """Refuses a folder that files can't be written to, before anything is done; makes it.
+
+    Args:
+        path: the folder.
+        key: the setting that names it.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path):
+            pass
+    except OSError as error:
+        raise SettingsError(f"{key} must be a folder that can be written to, got {str(path)!r} ({error}).") from error
 
 
 _RESULTS: ContextVar[TextIO | None] = ContextVar("results", default=None)

@@ -106,5 +106,7 @@ def _in_training(error: Exception, run: Plan, trainer: Trainer, goes_on: str) ->
         if newest is None
         else f"goes on from the last checkpoint, {newest.name}"
     )
+    if isinstance(error, ValueError) and _is_ours(error):
+        end += "; with KEY=VALUE resume_override=true where a setting was wrong"
     notes = "".join(f" {note}" for note in getattr(error, "__notes__", ()))
     return f"{what} ({where}; traceback in {run.folder / layout.ERROR}); when that is fixed, {goes_on} {end}.{notes}"

@@ -60,9 +60,9 @@ def misspelt(arguments: Sequence[str]) -> list[str]:
                     told.append(key)
         except Exception:  # only a hint is lost
             return []
-    settings = list(flat(OmegaConf.to_container(known)))
+    settings = flat(OmegaConf.to_container(known))
     groups = sorted(path.name for path in CONF.iterdir() if path.is_dir())
-    return [_sentence(key, [*settings, *groups]) for key in told]
+    return [_entry_by_entry(key) if settings.get(key) == {} else _sentence(key, [*settings, *groups]) for key in told]
 
 
 def _alone(override: Override) -> str:
@@ -78,6 +78,10 @@ def _search_path(arguments: Sequence[str]) -> Iterator[str]:
         name, _, joined = option.partition("=")
         if name in ("--config-dir", "-cd"):
             yield f"hydra.searchpath=['file://{Path(joined or value).absolute()}']"
+
+
+def _entry_by_entry(key: str) -> str:
+    return f"error: {key} takes entries of your own one by one, not as a whole: '+{key}.NAME=VALUE'."
 
 
 def _sentence(key: str, known: Sequence[str]) -> str:

@@ -50,7 +50,7 @@ from hdrqn_torchrl.analysis.results import (
     final_value,
     source_of,
 )
-from hdrqn_torchrl.cli.command_line import as_list, command_line
+from hdrqn_torchrl.cli.command_line import as_list, check_place, command_line
 from hdrqn_torchrl.cli.entries import common_references, note, read_entries, shortened
 from hdrqn_torchrl.runs.persistence import layout
 from hdrqn_torchrl.runs.settings.arguments import SettingsError
@@ -86,6 +86,8 @@ def run(settings: Settings) -> None:
     """Reads, groups, sums up, draws."""
     check(settings)
     out = [Path(str(name)) for name in as_list(settings.out)]
+    for path in out:
+        check_place(path, "out")
     entries = read_entries([str(pattern) for pattern in as_list(settings.runs)])
     panels = choose_panels(settings, entries)
     try:

@@ -26,7 +26,9 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig, open_dict, read_write
 
+from hdrqn_torchrl.cli.command_line import check_folder
 from hdrqn_torchrl.cli.ledger import DONE, STARTED, ledger_of, read_ledger, report, unfinished, write_note
+from hdrqn_torchrl.runs.settings.arguments import SettingsError
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 POLL_SECONDS = 1.0
@@ -58,8 +60,13 @@ class Sweep(Callback):
     def __init__(self) -> None:
         self.ledger: Path | None = None  # None: not a sweep
 
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        """Before the folder of a single training is made."""
+        _check_folder(config.hydra.run.dir, "hydra.run.dir (in output_root, unless it is given)")
+
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         """In the main process, before all jobs."""
+        _check_folder(config.hydra.sweep.dir, "hydra.sweep.dir (in output_root, unless it is given)")
         ledger = ledger_of(config.hydra)
         self.ledger = ledger.absolute()  # jobs may have other working directories
         self.ledger.unlink(missing_ok=True)
@@ -104,6 +111,13 @@ class Sweep(Callback):
         assert self.ledger is not None
         if not _stop.orphaned:  # else the same command may have been started again: the ledger belongs to that sweep
             write_note(self.ledger, config.hydra, state)
+
+
+def _check_folder(folder: str, key: str) -> None:
+    try:
+        check_folder(Path(folder), key)
+    except SettingsError as error:
+        sys.exit(f"error: {error}")  # Hydra goes on after exceptions of callbacks
 
 
 def note_folder(folder: Path) -> None:

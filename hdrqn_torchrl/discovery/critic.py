@@ -132,7 +132,8 @@ class DiscoveredSubgoals(Transform):
         self.__dict__["critic"] = critic
 
     def __deepcopy__(self, memo: dict[int, Any]) -> DiscoveredSubgoals:
-        return DiscoveredSubgoals(memo.get(id(self.critic), self.critic))  # an agent's copy has a critic of its own
+        of_copy = memo.get(id(self.critic))  # where an agent is copied, which has its own
+        return DiscoveredSubgoals(self.critic if of_copy is None else of_copy)
 
     def restated(self, task: Task) -> Task:
         """What is left of a task's statement: its subgoals are those that the agent finds, in no order."""

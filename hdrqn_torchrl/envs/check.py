@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import traceback
+from pathlib import Path
 from collections.abc import Iterator
 
 import torch
@@ -56,7 +58,18 @@ def check_task(
                 found += check_behaviour(env, task, _sets(env, task), steps=steps, seed=seed)
             except ReturnError as error:
                 found.append(wrong(str(error), "training stops there"))
+            except Exception as error:  # whatever the environment raises
+                found.append(wrong(_raised(error), "training stops there"))
     return sorted(dict.fromkeys(found), key=lambda finding: finding.severity != "wrong")
+
+
+def _raised(error: Exception) -> str:
+    """What an environment raised, and where; errors of this package say all themselves."""
+    *_, (frame, line) = traceback.walk_tb(error.__traceback__)
+    place = Path(frame.f_code.co_filename)
+    if isinstance(error, ValueError) and place.is_relative_to(Path(__file__).parents[1]):
+        return str(error)
+    return f"stepping it raised {type(error).__name__}: {error} ({place}:{line})"
 
 
 def _sets(env: EnvBase, task: Task) -> tuple[SubgoalSet, ...]:

@@ -35,10 +35,10 @@ def check_behaviour(env: EnvBase, task: Task, sets: Sequence[SubgoalSet], *, ste
         seed: the first of two.
     """
     first, again, other = (_rollout(env, steps, each, seed) for each in (seed, seed, seed + 1))
-    found = list(check_shapes(env, first[0])) or list(
-        check_values(first + other, env.observation_spec[keys.OBSERVATION])
-    )
-    if found:
+    for step in first + other:
+        if found := list(check_shapes(env, step)):
+            return found
+    if found := list(check_values(first + other, env.observation_spec[keys.OBSERVATION])):
         return found
     for rollout in (first, other):
         found += [*_ends(rollout, task), *_paid(rollout), *_returns(rollout, task), *check_masks(rollout)]

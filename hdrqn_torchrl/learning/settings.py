@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 from hdrqn_torchrl.data import FROM_STARTS, Sampling
 from hdrqn_torchrl.learning.captured import Capture
 from hdrqn_torchrl.learning.precision import Precision
-from hdrqn_torchrl.modules.sizes import check_size
+from hdrqn_torchrl.modules.sizes import check_number, check_size
 from hdrqn_torchrl.objectives import check_returns, target_lookahead
 
 _LARGEST_SCALE = 10_000
@@ -105,6 +105,10 @@ class LearnerSettings:
     capture: Capture = "auto"
 
     def __post_init__(self) -> None:
+        for each in fields(self):
+            value, usual = getattr(self, each.name), each.default
+            if isinstance(usual, int | float) and not isinstance(usual, bool) and value is not None:
+                check_number(each.name, value, usual)
         check_returns(self.trace_decay, self.n_step)
         slice_len = 2 if self.slice_len is None else self.slice_len
         rules = (

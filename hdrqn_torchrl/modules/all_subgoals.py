@@ -23,7 +23,7 @@ from hdrqn_torchrl.modules.exploration_checks import (
     check_two_schedules,
     exploration_or_greedy,
 )
-from hdrqn_torchrl.modules.recurrent_state import first_state
+from hdrqn_torchrl.modules.recurrent_state import first_state, read_flag
 from hdrqn_torchrl.modules.symmetric_mean import SymmetricMean
 
 
@@ -153,9 +153,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         return TensorDictPrimer({**carried, **self._carried}, expand_specs=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        read = (self.observation_key, self.previous_action_key, self.init_key)
-        observation, previous_action, init = (tensordict.get(key) for key in read)
-        init = init.squeeze(-1)
+        observation, previous_action = (tensordict.get(key) for key in (self.observation_key, self.previous_action_key))
+        init = read_flag(tensordict, self.init_key).squeeze(-1)
         masks = [tensordict.get(key) for key in self.mask_keys]
         if recurrent_mode():
             state = first_state(tensordict, self.state_keys)

@@ -10,7 +10,7 @@ from torchrl.data import TensorSpec
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from hdrqn_torchrl.keys import OptionKeys
-from hdrqn_torchrl.modules.sizes import check_size
+from hdrqn_torchrl.modules.sizes import check_number, check_size
 
 
 class EpsilonGreedy(nn.Module):
@@ -69,6 +69,8 @@ class EpsilonGreedy(nn.Module):
         self, start: float = 1.0, end: float = 0.1, *, anneal_frames: int = 100_000, ladder: float = 0.0
     ) -> None:
         super().__init__()
+        for name, value, usual in (("start", start, 1.0), ("end", end, 0.1), ("ladder", ladder, 0.0)):
+            check_number(name, value, usual)
         for name, value in (("start", start), ("end", end)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be an epsilon in [0, 1], got {value}; the paper goes from 1.0 to 0.1.")

@@ -13,6 +13,7 @@ from torch.nn import ModuleList
 from hdrqn_torchrl import keys
 from hdrqn_torchrl.modules.exploration_checks import check_two_schedules
 from hdrqn_torchrl.modules.meta_controller import MetaController
+from hdrqn_torchrl.modules.recurrent_state import read_flag
 from hdrqn_torchrl.modules.sub_controller import SubController
 
 
@@ -85,9 +86,10 @@ class HierarchicalPolicy(TensorDictModuleBase):
         return [self.meta_controller, *self.middle_controllers, self.sub_controller]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        gate = read_flag(tensordict, self.meta_controller.gate_key)
         if self.read_last_observation:
             meta, sub = self.meta_controller, self.sub_controller
-            ended = tensordict.get(meta.gate_key) & ~tensordict.get(self.init_key)
+            ended = gate & ~tensordict.get(self.init_key)
             advanced = sub.advance(tensordict, meta.active_subgoal_key)
             for key, value in zip((sub.hidden_key, sub.cell_key), advanced, strict=True):
                 tensordict.set(key, torch.where(ended, value, tensordict.get(key)))

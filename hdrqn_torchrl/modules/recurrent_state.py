@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs.transforms import TensorDictPrimer
 
@@ -17,6 +18,17 @@ def first_state(tensordict: TensorDictBase, state_keys: Sequence[NestedKey]) -> 
         return None
     hidden, cell = (tensordict.get(key) for key in state_keys)
     return hidden[:, 0], cell[:, 0]
+
+
+def read_flag(tensordict: TensorDictBase, key: NestedKey) -> Tensor:
+    """A flag that an environment with an agent's transforms writes.
+
+    Raises:
+        KeyError: if it is missing.
+    """
+    if (flag := tensordict.get(key, None)) is None:
+        raise KeyError(f"{key!r} is missing: the policy must act in agent.transform(env), which writes what it reads.")
+    return flag
 
 
 def state_primer(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from numbers import Integral
+from numbers import Integral, Real
 
 
 def check_size(name: str, size: int, usual: int | str, *, least: int = 1, most: int | None = None) -> None:
@@ -31,6 +31,21 @@ def check_size(name: str, size: int, usual: int | str, *, least: int = 1, most: 
         raise ValueError(f"{name} must be >= {least}, got {size}; use {usual}.")
     if most is not None and size > most:
         raise ValueError(f"{name} must be <= {most:,}, got {size}; use {usual}.")
+
+
+def check_number(name: str, value: float, usual: float | str) -> None:
+    """Refuses what is no number, such as text that holds one.
+
+    Args:
+        name: name of the argument, for the message.
+        value: its value.
+        usual: a value that works, for the message.
+
+    Raises:
+        ValueError: if it is none.
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        raise ValueError(f"{name} must be a number, got {value!r}; use {usual}.")
 
 
 def check_memory_span(steps: int) -> None:

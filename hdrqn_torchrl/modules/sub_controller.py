@@ -23,7 +23,7 @@ from hdrqn_torchrl.modules.exploration_checks import (
     exploration_or_greedy,
 )
 from hdrqn_torchrl.modules.q_network import QNetwork, State
-from hdrqn_torchrl.modules.recurrent_state import first_state, state_primer
+from hdrqn_torchrl.modules.recurrent_state import first_state, read_flag, state_primer
 
 
 class SubController(TensorDictModuleBase):
@@ -127,7 +127,7 @@ class SubController(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict.get(self.observation_key)
         subgoal = None if self.subgoal_key is None else tensordict.get(self.subgoal_key)
-        init = tensordict.get(self.init_key)  # [*batch, 1]
+        init = read_flag(tensordict, self.init_key)  # [*batch, 1]
         if recurrent_mode():
             state = first_state(tensordict, self.state_keys)
             memory = self.network.remember(observation, subgoal, init.squeeze(-1), state)

@@ -32,6 +32,8 @@ class Critic(Transform):
             the farthest one.
         repeatable: whether a subgoal can be attained more than once in an episode.
         attained_key: the entry written; ``None``: ``attained`` with the prefix.
+        keeps_available: whether the environment's ``available`` is about these subgoals. It is taken out otherwise (but
+            with an ``attained_key`` of its own), as it is about those that are replaced.
 
     Raises:
         ValueError: if ``num_subgoals`` is not positive, there is another number of names, or, in a step, if the verdict
@@ -55,6 +57,7 @@ class Critic(Transform):
         prefix: str = "",
         repeatable: bool = False,
         attained_key: NestedKey | None = None,
+        keeps_available: bool = False,
     ) -> None:
         if not isinstance(num_subgoals, int) or num_subgoals < 1:
             raise ValueError(
@@ -65,6 +68,8 @@ class Critic(Transform):
         if names is not None and len(names) != num_subgoals:
             raise ValueError(f"names must be one for each of {num_subgoals} subgoals, got {len(names)}.")
         self.attained_key = attained_key or keys.OptionKeys(prefix).attained
+        replaces = attained_key is None and not keeps_available
+        self._replaced = keys.OptionKeys(prefix).available if replaces else None
         super().__init__(in_keys=[], out_keys=[self.attained_key])
         self.num_subgoals, self.verdict = num_subgoals, verdict
         self.names = tuple(names or (f"subgoal {index}" for index in range(num_subgoals)))
@@ -80,12 +85,18 @@ class Critic(Transform):
                 f"verdict must return which of num_subgoals={self.num_subgoals} subgoals a step attained, {shape} "
                 f"torch.bool, got {got}; compare, and stack along the last dimension."
             )
-        return next_tensordict.set(self.attained_key, attained)
+        return self._without(next_tensordict).set(self.attained_key, attained)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         shape = (*tensordict_reset.batch_size, self.num_subgoals)
         attained = torch.zeros(shape, dtype=torch.bool, device=tensordict_reset.device)
-        return set_where_reset(tensordict, tensordict_reset, {self.attained_key: attained})
+        return set_where_reset(tensordict, self._without(tensordict_reset), {self.attained_key: attained})
+
+    def _without(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Takes out what the environment says of the subgoals that are replaced."""
+        if self._replaced is not None and self._replaced in tensordict:
+            tensordict.del_(self._replaced)
+        return tensordict
 
     def _reset_on_native_autoreset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -94,6 +105,8 @@ class Critic(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         shape = (*observation_spec.shape, self.num_subgoals)
+        if self._replaced is not None and observation_spec.get(self._replaced, None) is not None:
+            del observation_spec[self._replaced]
         set_spec(
             observation_spec, self.attained_key, Binary(shape=shape, dtype=torch.bool, device=observation_spec.device)
         )

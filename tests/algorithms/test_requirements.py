@@ -15,6 +15,7 @@ from user_envs import Corridor, Walk
 
 from hdrqn_torchrl.algorithms import make_dqn, make_drqn, make_hdqn, make_hdrqn, make_v3
 from hdrqn_torchrl.envs import make_montezuma
+from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.modules import Architecture, Features, FullyConnectedFeatures, compact_network
 
 EVERY = [*ALGORITHMS, "v3"]
@@ -81,6 +82,27 @@ def test_an_environment_without_worlds_is_refused():
 def test_total_frames_that_is_no_whole_number_from_1_on_is_refused(total_frames):
     with pytest.raises(ValueError, match=rf"total_frames must be .*>= 1, got {total_frames!r}; "):
         make_v3(small_env(N), compact_network(), total_frames=total_frames)
+
+
+@pytest.mark.parametrize("name, argument", [("dqn", "learner"), ("v3", "learner"), ("hdqn", "sub"), ("v2", "middle")])
+def test_learners_settings_of_another_kind_are_refused(name, argument):
+    builders = {"dqn": make_dqn, "v3": make_v3, "hdqn": make_hdqn, "v2": make_hdrqn}
+    with pytest.raises(ValueError, match=rf"^{argument} must be LearnerSettings, got \{{'tau': 0.1\}}; "):
+        builders[name](small_env(N), PLAIN, **{argument: {"tau": 0.1}})
+    with pytest.raises(ValueError, match=r"^tau must be a number, got '0.1'; use 0.003"):
+        LearnerSettings(tau="0.1")
+
+
+def test_a_bonus_for_subgoals_asks_for_some():
+    with pytest.raises(ValueError, match=r"'attained' must be .* it is missing: the task states no subgoals"):
+        make_v3(Corridor(N, without=("attained",)), PLAIN, levels=1, bonus_reward=1.0)
+
+
+@pytest.mark.parametrize("name", EVERY)
+def test_a_policy_in_a_bare_environment_says_where_it_must_act(name):
+    env = small_env(N)
+    with pytest.raises(KeyError, match=r"is missing: the policy must act in agent\.transform\(env\)"):
+        env.rollout(2, build(name, env).policy)
 
 
 class TestActions:

@@ -24,6 +24,11 @@ def test_a_misspelt_setting_is_named_with_those_that_it_resembles(arguments):
     assert "--cfg job` shows every setting" in sentence
 
 
+def test_entries_of_one_s_own_are_given_one_by_one():
+    (sentence,) = misspelt(["env=gym", "env.settings={wheels:4}"])
+    assert sentence.endswith("takes entries of your own one by one, not as a whole: '+env.settings.NAME=VALUE'.")
+
+
 def test_each_of_several_is_named():
     assert [each.split()[1] for each in misspelt(["sed=1", "env.view=3", "total_frame=5"])] == ["sed", "total_frame"]
 

@@ -264,6 +264,7 @@ def test_a_folder_with_nothing_but_metrics_is_drawn(run, tmp_path):
         (["runs=outputs", "out=[a.png,b]"], "got 'b'"),
         (["runs=outputs", "out=[]"], "out must name at least one file"),
         (["runs=outputs", "out=outputs/metrics.csv"], "out must not have the name of a run's own data"),
+        (["runs=outputs", "out=/dev/null/a.png"], "out must be a file that can be written, got"),
         (["runs=outputs", "out=a.png", "kind=lines"], "kind must be one of curves, greedy, discovery, bars, got"),
         (
             ["runs=outputs", "out=a.png", "x=steps"],

@@ -212,6 +212,30 @@ def test_values_that_are_no_numbers_or_no_codes_are_the_only_fault_that_is_told(
     assert wrong(env) == [fault]
 
 
+class Changing(Corridor):
+    """After some steps its observation has another shape."""
+
+    def _step(self, tensordict):
+        self.calls = getattr(self, "calls", 0) + 1
+        after = super()._step(tensordict)
+        return after if self.calls < 9 else after.set("observation", after["observation"][..., :1].double())
+
+
+class Raising(Changing):
+    def _step(self, tensordict):
+        after = super()._step(tensordict)
+        if self.calls > 9:
+            raise ZeroDivisionError("no way")
+        return after
+
+
+def test_what_goes_wrong_only_after_some_steps_is_a_fault_too():
+    (fault,) = wrong(Changing(4))
+    assert fault.startswith("'observation' must be ") and "as its spec says, got torch.float64" in fault
+    (fault,) = wrong(Raising(4))
+    assert fault.startswith(f"stepping it raised ZeroDivisionError: no way ({__file__}:")
+
+
 @pytest.mark.parametrize(
     "env, costs",
     [

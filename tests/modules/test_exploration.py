@@ -93,6 +93,8 @@ def test_the_schedule_travels_in_the_state_dict():
     ("arguments", "message"),
     [
         ({"start": 1.5}, r"start must be an epsilon in \[0, 1\], got 1.5; "),
+        ({"start": "1.0"}, r"start must be a number, got '1.0'; use 1.0"),
+        ({"ladder": None}, "ladder must be a number, got None; use 0.0"),
         ({"end": -0.1}, r"end must be an epsilon in \[0, 1\], got -0.1; "),
         ({"anneal_frames": 0}, "anneal_frames must be >= 1, got 0; "),
     ],

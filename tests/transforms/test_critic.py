@@ -2,13 +2,15 @@ from functools import partial
 
 import pytest
 import torch
+from gym_toys import Counter, Milestones
 from helpers import AGENT, CORRIDOR, OBJECTS, RIGHT, build, collect, small_env
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import ExcludeTransform, RenameTransform
 from torchrl.envs.utils import check_env_specs, step_mdp
 
-from hdrqn_torchrl.envs import MultiGoalGridEnv, task_of
+from hdrqn_torchrl.envs import MultiGoalGridEnv, make_gym, task_of
 from hdrqn_torchrl.learning.legs import LegCounter
+from hdrqn_torchrl.modules import compact_network
 from hdrqn_torchrl.transforms import Critic, SubgoalTransform
 
 GOALS = task_of(small_env()).subgoals[-1].names
@@ -50,6 +52,23 @@ class TestAttained:
         before["attained"] = torch.ones(3, 2, dtype=torch.bool)
         after = env.reset(before.clone().set("_reset", torch.tensor([[False], [True], [False]])))
         assert after["attained"].tolist() == [[True, True], [False, False], [True, True]]
+
+
+@pytest.mark.parametrize("number", [2, 3])
+def test_what_the_environment_says_of_its_own_subgoals_does_not_hold_for_those_of_a_critic(number):
+    def counted(after):
+        return torch.stack([after["observation"][..., 0] == count for count in (6, 7, 8)[:number]], -1)
+
+    env = TransformedEnv(make_gym(Counter, 4, subgoals=Milestones(), seed=0), Critic(number, counted))
+    check_env_specs(env)
+    assert "available" in env.base_env.rollout(2) and "available" not in env.rollout(2)
+    agent = build("v3", env, compact_network(8, (8,)))
+    steps = agent.transform(env).rollout(30, agent.policy, break_when_any_done=False)
+    left = steps["subgoal_mask"][:, :-1] & ~steps["next", "attained"][:, :-1]
+    goes_on = ~steps["next", "done"][:, :-1]
+    assert left.any() and torch.equal(left & goes_on, steps["subgoal_mask"][:, 1:] & goes_on)
+    critic = Critic(number, counted, keeps_available=True)
+    assert "available" in TransformedEnv(make_gym(Counter, 4, subgoals=Milestones(), seed=0), critic).rollout(2)
 
 
 @pytest.mark.parametrize("transform", [partial(Critic, 2), lambda verdict: SubgoalTransform(2, critic=verdict)])

@@ -55,7 +55,7 @@ def check_id(id: Any) -> None:
 
 
 def check_given(
-    id: Any, num_envs: Any, *, settings: Any, package: Any, wrappers: Any, actions: Any, max_steps: Any
+    id: Any, num_envs: Any, *, settings: Any, package: Any, wrappers: Any, actions: Any, max_steps: Any, seed: Any
 ) -> None:
     """Refuses arguments of the wrong kind.
 
@@ -70,6 +70,8 @@ def check_given(
         raise ValueError(f"settings must be arguments of the environment by name, got {settings!r}; use {{'size': 5}}.")
     if package is not None and not (isinstance(package, str) and package):
         raise ValueError(f"package must be the name of a package, got {package!r}; None: Gymnasium's own environments.")
+    if seed is not None:
+        check_whole_number("seed", seed, least=0, remedy="None: one is drawn")
     check_list("actions", actions, Integral, "numbers of actions")
     if not isinstance(wrappers, Sequence) or isinstance(wrappers, str):
         raise ValueError(f"wrappers must be a list, got {wrappers!r}; put a single one into [...].")

@@ -30,7 +30,7 @@ from hdrqn_torchrl.envs.gym.arguments import (
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
 from hdrqn_torchrl.envs.gym.given import check_given, checked_world, wrapped
 from hdrqn_torchrl.envs.gym.observations import Channels, make_encoder
-from hdrqn_torchrl.envs.gym.pools import mask_place_of, pool_of, spec_of
+from hdrqn_torchrl.envs.gym.pools import mask_entry_of, mask_place_of, pool_of, spec_of
 from hdrqn_torchrl.envs.gym.returned import begun
 from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
 from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper
@@ -113,7 +113,14 @@ def make_gym(
             "have others; raise collector.workers instead."
         )
     check_given(
-        id, num_envs, settings=settings, package=package, wrappers=wrappers, actions=actions, max_steps=max_steps
+        id,
+        num_envs,
+        settings=settings,
+        package=package,
+        wrappers=wrappers,
+        actions=actions,
+        max_steps=max_steps,
+        seed=seed,
     )
     read = partial(
         _read,
@@ -188,10 +195,13 @@ def _read(
 ) -> tuple[Reading, tuple[int, ...]]:
     """How entries are read, and the numbers of the agent's actions, for the spaces of one world."""
     numbers = actions_of(acted, actions)
-    first = int(acted.start)  # type: ignore[attr-defined]
-    places = tuple(number - first for number in numbers) if masked else ()
+    first, number = int(acted.start), int(acted.n)  # type: ignore[attr-defined]
+    entry = None if masked else mask_entry_of(observed, number)
+    places = tuple(each - first for each in numbers) if masked or entry else ()
+    if entry is not None and options["entries"] is None:
+        options = {**options, "entries": [name for name in observed if name != entry]}  # type: ignore[attr-defined]
     encoder = make_encoder(observed, **options)
-    return Reading(encoder=encoder, masked_actions=places, num_actions=int(acted.n), **rest), numbers  # type: ignore[attr-defined]
+    return Reading(encoder=encoder, masked_actions=places, mask_entry=entry, num_actions=number, **rest), numbers
 
 
 def _own(make: Callable[..., gymnasium.Env], num_envs: int, read: Callable, *, processes: bool) -> _Made:

@@ -1,9 +1,11 @@
-"""Pools of EnvPool: whether it has an environment, how one is made, and where it tells which actions can be chosen."""
+"""Pools of EnvPool: whether it has an environment, how one is made; and where a world tells which actions there are."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
+
+from gymnasium import spaces
 
 from hdrqn_torchrl.envs.gym.arguments import settings_error
 
@@ -52,6 +54,12 @@ def pool_of(id: str, num_envs: int, settings: Mapping[str, Any], seed: int) -> A
     import envpool
 
     return envpool.make(id, env_type="gymnasium", num_envs=num_envs, seed=seed, **settings)
+
+
+def mask_entry_of(space: spaces.Space, num_actions: int) -> str | None:
+    """The entry of a ``Dict`` observation that tells which actions can be chosen, as in PettingZoo; ``None``: none."""
+    entries = space.spaces if isinstance(space, spaces.Dict) else {}
+    return next((name for name in _MASKS if name in entries and entries[name].shape == (num_actions,)), None)
 
 
 def mask_place_of(spec: Any) -> MaskPlace | None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium
@@ -71,12 +72,14 @@ class OwnWorlds:
         """See :class:`Worlds`."""
         seeds = np.zeros(len(mask), np.int64)
         seeds[mask] = self._generator.integers(_LARGEST_SEED, size=mask.sum())
-        entries, _ = self.vector.reset(seed=list(seeds.tolist()), options={"reset_mask": mask.copy()})
+        with _processes_watched():
+            entries, _ = self.vector.reset(seed=list(seeds.tolist()), options={"reset_mask": mask.copy()})
         return entries
 
     def step(self, actions: NDArray[np.int64]) -> Outcome:
         """See :class:`Worlds`."""
-        entries, reward, terminated, truncated, _ = self.vector.step(actions)
+        with _processes_watched():
+            entries, reward, terminated, truncated, _ = self.vector.step(actions)
         return Outcome(entries, reward.astype(np.float32), terminated, truncated)
 
     def state_dict(self) -> dict[str, Any] | None:
@@ -86,13 +89,26 @@ class OwnWorlds:
             return None
         return {"moments": moments, "generator": self._generator.bit_generator.state}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> Entries:
+    def load_state_dict(self, state: Mapping[str, Any]) -> Entries | None:
         """See :class:`Worlds`."""
         self.vector.reset()  # no world is over then
         self.vector.set_attr("moment", list(state["moments"]))
+        if any(self.vector.get_attr("lost")):
+            return None
         self._generator.bit_generator.state = state["generator"]
         shown = self.vector.get_attr("entries")
         return _stacked(shown)
+
+
+@contextmanager
+def _processes_watched() -> Iterator[None]:
+    """Says what has happened where the pipe to a world's process is broken."""
+    try:
+        yield
+    except (EOFError, ConnectionError) as error:
+        raise RuntimeError(
+            "the process of a world (processes=True) has ended; was it killed, or was there too little memory?"
+        ) from error
 
 
 class _WithoutState:

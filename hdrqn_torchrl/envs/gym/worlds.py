@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
@@ -50,6 +51,7 @@ class Reading:
         reward: the same for a reward in place of the environment's own.
         masked_actions: the agent's actions by their places among the environment's, if ``info["action_mask"]`` tells
             which ones of the environment's can be chosen; empty if it does not.
+        mask_entry: of a ``Dict`` observation that tells it in place of ``info``; ``None``: none does.
         num_actions: how many actions the environment has.
     """
 
@@ -59,6 +61,7 @@ class Reading:
     hazard: str | Rule | None = None
     reward: str | Rule | None = None
     masked_actions: tuple[int, ...] = ()
+    mask_entry: str | None = None
     num_actions: int = 0
 
     @cached_property
@@ -133,6 +136,8 @@ class World:
 
     def _entries(self, observation: Any, info: Mapping[str, Any], *, over: bool) -> Entries:
         entries: Entries = {keys.OBSERVATION: self.reading.encoder.encode(observation)}
+        if (name := self.reading.mask_entry) is not None:
+            info = {**info, keys.ACTION_MASK: observation[name]}
         if self.reading.masked_actions:
             entries[keys.ACTION_MASK] = _action_mask(info, self.reading, over=over)
         elif keys.ACTION_MASK in info:
@@ -194,6 +199,8 @@ class WorldWrapper(gymnasium.Wrapper):
         self._state = EnvState(env) if EnvState.is_offered(env) else None
         self._seed: int | None = None
         self._actions: list[int] | None = []  # None: there were too many
+        self.lost = False
+        """Whether the last :attr:`moment` could not be brought back."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -216,6 +223,18 @@ class WorldWrapper(gymnasium.Wrapper):
         self.entries, reward, terminated, truncated = self.world.step(*parts_of(returned, "step"))
         return self.entries, reward, terminated, truncated and not terminated, {}
 
+    def _played_again(self, seed: int, actions: Sequence[int]) -> bool:
+        """Whether an episode takes the same actions again; one that goes another way may refuse them."""
+        try:
+            self.reset(seed=seed)
+            for action in actions:
+                self.step(action)
+        except Exception as error:  # whatever the world raises
+            warnings.warn(f"an episode can't be played again as it was: {error!r}.", stacklevel=2)
+            self.reset()
+            return False
+        return True
+
     def _keep(self, action: int) -> None:
         if self._actions is not None and len(self._actions) < MOST_ACTIONS:
             self._actions.append(action)
@@ -236,9 +255,7 @@ class WorldWrapper(gymnasium.Wrapper):
     @moment.setter
     def moment(self, moment: Mapping[str, Any]) -> None:
         if self._state is None:
-            self.reset(seed=int(moment["seed"]))
-            for action in moment["actions"].tolist():
-                self.step(action)
+            self.lost = not self._played_again(int(moment["seed"]), moment["actions"].tolist())
             return
         self.reset()
         self._state.load_state_dict(moment["env"])

@@ -1,3 +1,4 @@
+from functools import partial
 from multiprocessing import current_process
 
 import gymnasium
@@ -132,6 +133,37 @@ class TestRules:
             assert torch.equal(each["action_mask"][..., 1:], each["observation"][..., :1] % 2 == 0)
 
 
+class Shown(Counter):
+    """Its mask is a part of what it shows."""
+
+    observation_space = spaces.Dict(count=Counter.observation_space, action_mask=spaces.MultiBinary(2))
+
+    def _shown(self):
+        return {"count": super()._shown(), "action_mask": np.array([1, self.count % 2 == 0], np.int8)}
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_action_masks_are_read_from_a_dict_observation(given):
+    vector = SyncVectorEnv([Shown] * 2, autoreset_mode=AutoresetMode.DISABLED)
+    env = make_gym(vector if given else Shown, 2, seed=0)
+    step = played(env, 12)
+    for each in (step, step["next"]):
+        assert each["observation"].shape[-1] == 2  # without the mask
+        assert torch.equal(each["action_mask"][..., 1:], each["observation"][..., :1] % 2 == 0)
+    if not given:
+        seen = make_gym(Shown, 2, entries=["count", "action_mask"], seed=0).reset()
+        assert seen["observation"].shape[-1] > 2 and "action_mask" in seen
+
+
+def test_a_world_whose_process_has_ended_is_told():
+    env = make_gym(Counter, 2, processes=True, seed=0)
+    step = env.reset().set("action", torch.zeros(2, dtype=torch.int64))
+    env.worlds.vector.processes[1].kill()
+    env.worlds.vector.processes[1].join()
+    with pytest.raises(RuntimeError, match=r"the process of a world \(processes=True\) has ended"):
+        env.step(step)
+
+
 @pytest.mark.parametrize("nested", [False, True])
 def test_worlds_of_a_vector_made_elsewhere_keep_their_tuples(nested):
     """As many parts as there are worlds, so that nothing but the space tells them apart."""
@@ -250,6 +282,19 @@ class TestState:
         cut = env.step(step.select("observation").set("action", torch.zeros(2).long()))["next"]
         assert cut["truncated"].all() and not any(cut[key].any() for key in outcome)
 
+    @pytest.mark.parametrize("processes", [False, True])
+    def test_actions_that_are_refused_when_they_are_taken_again_end_no_training(self, processes):
+        def second_if_it_can(tensordict):
+            return tensordict.set("action", tensordict["action_mask"][:, 1].long())
+
+        env = make_gym(partial(Forgetful, masked=True), 8, seed=0, processes=processes)
+        env.rollout(3, second_if_it_can, break_when_any_done=False)
+        with pytest.warns(UserWarning, match="could not be brought back"):
+            env.load_state_dict(env.state_dict())
+        step = env.rollout(5, second_if_it_can, break_when_any_done=False)
+        assert not step["next", "truncated"].any()
+        env.close()
+
     def test_an_episode_of_too_many_actions_is_cut_off_and_the_next_one_is_brought_back(self, monkeypatch):
         monkeypatch.setattr(worlds, "MOST_ACTIONS", 5)
         env = make_gym(lambda: Counter(ends=False), 2, seed=0)
@@ -307,6 +352,8 @@ class TestState:
         ("CartPole-v1", {"num_envs": None}, "num_envs must be a whole number >= 1, got None"),
         ("CartPole-v1", {"max_steps": "7"}, "max_steps must be a whole number >= 1, got '7'"),
         ("CartPole-v1", {"max_steps": 1.5}, "max_steps must be a whole number >= 1, got 1.5"),
+        ("CartPole-v1", {"seed": "0"}, "seed must be a whole number >= 0, got '0'; None: one is drawn"),
+        ("CartPole-v1", {"seed": -1}, "seed must be a whole number >= 0, got -1"),
         ("CartPole-v1", {"max_steps": True}, "max_steps must be a whole number >= 1, got True"),
         ("CartPole-v1", {"actions": 2}, r"actions must be a list of numbers of actions, got 2; put .* into \[...\]"),
         ("CartPole-v1", {"actions": [0.5]}, r"actions must be a list of numbers of actions, got \[0.5\]"),
