@@ -101,8 +101,8 @@ class AllSubgoalsPolicy(TensorDictModuleBase):
         self._check_explorations()
         self.subgoal_keys = tuple(subgoal_keys)
         pursuing = [self.sub_exploration, *self.middle_explorations] if subgoal_keys else []
-        above = [*subgoal_keys[1:], None]
-        for exploration, number, each, upper in zip(pursuing, network.num_subgoals, subgoal_keys, above, strict=False):
+        above = [*subgoal_keys[1:], None][: len(subgoal_keys)]
+        for exploration, number, each, upper in zip(pursuing, network.num_subgoals, subgoal_keys, above, strict=True):
             exploration.set_num_subgoals(number, names=each, upper_names=upper)
         self.observation_key, self.previous_action_key, self.init_key = observation_key, previous_action_key, init_key
         self.action_key, self.action_value_key = action_key, action_value_key
