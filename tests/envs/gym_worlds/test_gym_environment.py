@@ -287,7 +287,7 @@ class TestState:
         def second_if_it_can(tensordict):
             return tensordict.set("action", tensordict["action_mask"][:, 1].long())
 
-        env = make_gym(partial(Forgetful, masked=True), 8, seed=0, processes=processes)
+        env = make_gym(partial(Forgetful, masked=True), 2 if processes else 8, seed=0, processes=processes)
         env.rollout(3, second_if_it_can, break_when_any_done=False)
         with pytest.warns(UserWarning, match="could not be brought back"):
             env.load_state_dict(env.state_dict())
