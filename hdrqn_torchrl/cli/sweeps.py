@@ -62,6 +62,7 @@ class Sweep(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         """Before the folder of a single training is made."""
+        HydraConfig.instance().set_config(config)  # which the folder's name refers to
         _check_folder(config.hydra.run.dir, "hydra.run.dir (in output_root, unless it is given)")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:

@@ -248,12 +248,11 @@ class TestCallback:
         callback.on_multirun_start(job_config(tmp_path))
         assert ledger.read_ledger(callback.ledger) == []
 
-    @pytest.mark.parametrize("kind", ["run", "multirun"])
-    def test_a_folder_that_can_not_be_written_to_ends_it_before_it_begins(self, kind, tmp_path):
+    def test_a_folder_that_can_not_be_written_to_ends_it_before_it_begins(self, tmp_path):
         (tmp_path / "file").write_text("")
-        config = OmegaConf.create({"hydra": {each: {"dir": str(tmp_path / "file" / "x")} for each in ("run", "sweep")}})
-        with pytest.raises(SystemExit, match=r"^error: hydra\..* must be a folder that can be written to, got"):
-            getattr(sweeps.Sweep(), f"on_{kind}_start")(config)
+        config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path / "file" / "x")}}})
+        with pytest.raises(SystemExit, match=r"^error: hydra\.sweep\.dir .* must be a folder that can be written to"):
+            sweeps.Sweep().on_multirun_start(config)
 
     def test_a_single_run_is_left_alone(self, tmp_path):
         callback, result = sweeps.Sweep(), job_return(ValueError("x"))

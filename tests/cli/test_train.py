@@ -594,6 +594,10 @@ class TestFailures:
 
     def test_a_run_folder_that_can_not_be_made_is_reported(self, tmp_path):
         (tmp_path / "file").write_text("")
+        code, _, told = run_script(tmp_path, *SHORT, "output_root=file")
+        assert code == 1 and told.startswith(
+            "error: hydra.run.dir (in output_root, unless it is given) must be a folder"
+        )
         code, _, told = run_script(tmp_path, *SHORT, "hydra.run.dir=file/run")
         assert code == 1 and "Traceback" not in told
         (line,) = told.strip().splitlines()
