@@ -113,14 +113,14 @@ def _copy(transforms: Sequence[Transform]) -> Compose:
     return Compose(*deepcopy(transforms))
 
 
-def check_learners(**given: object) -> None:
-    """Refuses settings of learners, by the name of their argument, that are something else; ``None`` is none of them.
+def require_settings(**given: object) -> None:
+    """Refuses settings of learners, by the name of their argument, that are something else.
 
     Raises:
         ValueError: naming the argument.
     """
     for name, each in given.items():
-        if each is not None and not isinstance(each, LearnerSettings):
+        if not isinstance(each, LearnerSettings):
             raise ValueError(
                 f"{name} must be LearnerSettings, got {each!r}; dataclasses.replace changes some of others, "
                 "for instance replace(V3_LEARNER, batch_size=16)."

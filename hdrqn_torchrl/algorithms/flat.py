@@ -9,9 +9,9 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import presets
 from hdrqn_torchrl.algorithms.base import (
     Algorithm,
-    check_learners,
     copies_of,
     make_recurrent_loss,
+    require_settings,
     settings_named,
     stored_states,
 )
@@ -57,7 +57,7 @@ def make_drqn(
         >>> list(make_drqn(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['flat']
     """
-    check_learners(learner=learner)
+    require_settings(learner=learner)
     learner, exploration = learner.lasting(total_frames), exploration or presets.flat_exploration()
     has = check_environment(env, architecture, builder="make_drqn" if recurrent else "make_dqn", levels=1)
     network = architecture.q_network(

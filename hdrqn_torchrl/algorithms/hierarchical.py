@@ -10,7 +10,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import InitTracker
 
 from hdrqn_torchrl.algorithms import presets
-from hdrqn_torchrl.algorithms.base import Algorithm, check_learners, copies_of
+from hdrqn_torchrl.algorithms.base import Algorithm, copies_of, require_settings
 from hdrqn_torchrl.algorithms.books import make_books
 from hdrqn_torchrl.algorithms.discovering import finding_subgoals, finds_subgoals
 from hdrqn_torchrl.algorithms.hdrqn_levels import LevelBuilder
@@ -117,9 +117,10 @@ def make_hdrqn(
         ['sub', 'meta']
     """
     _check_version(version, recurrent, meta_input, meta_input_time, refresh_hidden_steps)
-    check_learners(sub=sub, meta=meta, middle=middle)
-    meta = (meta or presets.meta_learner(version)).lasting(total_frames)
-    sub, middle = sub.lasting(total_frames), (middle or meta).lasting(total_frames)
+    meta = presets.meta_learner(version) if meta is None else meta
+    middle = meta if middle is None else middle
+    require_settings(sub=sub, meta=meta, middle=middle)
+    sub, meta, middle = (each.lasting(total_frames) for each in (sub, meta, middle))
     _check_levels(levels, meta_hindsight, meta_input_time)
     _check_hindsight(sub, meta, sub_hindsight, meta_hindsight)
     finds = finds_subgoals(subgoals, levels=levels, phase_one=phase_one, learns_all=sub_hindsight)

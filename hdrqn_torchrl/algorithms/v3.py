@@ -15,9 +15,9 @@ from hdrqn_torchrl import keys
 from hdrqn_torchrl.algorithms import presets
 from hdrqn_torchrl.algorithms.base import (
     Algorithm,
-    check_learners,
     copies_of,
     largest_target,
+    require_settings,
     settings_named,
     stored_states,
 )
@@ -130,7 +130,7 @@ def make_v3(
         >>> list(make_v3(MultiGoalGridEnv(num_envs=4), compact_network()).learners)
         ['joint']
     """
-    check_learners(learner=learner)
+    require_settings(learner=learner)
     check_learner(learner)
     if joint and meta_learning_rate is not None:
         raise ValueError(f"meta_learning_rate must be None with joint=True, got {meta_learning_rate}; use joint=False.")

@@ -67,7 +67,7 @@ class EventSelection:
         self.reasons: dict[int, int] = {}
         """Why each token is a subgoal."""
         self.control = Control(max_subgoals + 1)
-        self._given_once: list[int] = []  # slots whose events nothing was seen of yet
+        self._once: list[int] = []
         self._dropped: list[int] = []
         self._record = EventRecord(detector.num_tokens)
 
@@ -86,11 +86,12 @@ class EventSelection:
             if reason != DEED or events[index] not in self._dropped:
                 self._keep(events[index], reason)
         own = Occurrences(history, list(self.slots))  # an event with a slot may since have become part of another one
-        return Chosen(slots=dict(self.slots), once=slots_attained_once(self.slots, own, unseen=self._given_once))
+        self._once = slots_attained_once(self.slots, own, before=self._once)
+        return Chosen(slots=dict(self.slots), once=list(self._once))
 
     def take_over(self, chosen: Chosen) -> None:
         """Begins with subgoals that an agent has already; they keep their slots."""
-        self.slots, self._given_once = dict(chosen.slots), list(chosen.once)
+        self.slots, self._once = dict(chosen.slots), list(chosen.once)
         self.reasons = dict.fromkeys(self.slots, LEADS)
 
     def _wanted(self, found: Occurrences, history: History) -> list[tuple[int, int]]:
@@ -144,7 +145,7 @@ class EventSelection:
             **self._record.state_dict(),
             "slots": dict(self.slots),
             "reasons": dict(self.reasons),
-            "given_once": list(self._given_once),
+            "once": list(self._once),
             "dropped": list(self._dropped),
             "control": self.control.state_dict(),
         }
@@ -153,7 +154,7 @@ class EventSelection:
         """Restores what :meth:`state_dict` returned."""
         self._record.load_state_dict(state)
         self.slots, self.reasons = dict(state["slots"]), dict(state["reasons"])
-        self._given_once = list(state.get("given_once", []))  # earlier versions had none
+        self._once = list(state.get("once", []))  # earlier versions had none
         self._dropped = list(state["dropped"])
         self.control.load_state_dict(state["control"])
 

@@ -109,18 +109,18 @@ class Occurrences:
         return times * _divergence(share, chance) * (share > chance), share
 
 
-def slots_attained_once(slots: Mapping[int, int], found: Occurrences, *, unseen: Collection[int] = ()) -> list[int]:
+def slots_attained_once(slots: Mapping[int, int], found: Occurrences, *, before: Collection[int] = ()) -> list[int]:
     """Slots of events that come a second time in fewer than 1 in 20 of their episodes, in ascending order.
 
     Args:
         slots: by token.
         found: events, those with a slot among them.
-        unseen: slots that count, too, as long as their events have not happened.
+        before: slots that were such before; they still are if nothing is known of their events (any more).
     """
     seldom, happened = (found.repeated * 20 < found.happened).tolist(), (found.happened > 0).tolist()
     once = {token for token, is_once in zip(found.events, seldom, strict=True) if is_once}
     seen = {token for token, has in zip(found.events, happened, strict=True) if has}
-    return sorted(slot for token, slot in slots.items() if token in once or (slot in unseen and token not in seen))
+    return sorted(slot for token, slot in slots.items() if token in once or (slot in before and token not in seen))
 
 
 def _divergence(share: Tensor, chance: Tensor) -> Tensor:

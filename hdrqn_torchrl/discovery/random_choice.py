@@ -48,7 +48,6 @@ class RandomSelection:
         self.slots: dict[int, int] = {}
         """Slot by token."""
         self._once: list[int] = []
-        self._given_once: list[int] = []  # slots whose events nothing was seen of yet
         self._record = EventRecord(num_tokens)
 
     def observe(self, batch: TensorDictBase) -> None:
@@ -70,22 +69,20 @@ class RandomSelection:
         for place, slot in zip(torch.randperm(len(others)).tolist(), free, strict=False):
             self.slots[others[place]] = slot
         own = Occurrences(history, list(self.slots))
-        self._once = slots_attained_once(self.slots, own, unseen=self._given_once)
+        self._once = slots_attained_once(self.slots, own, before=self._once)
 
     def take_over(self, chosen: Chosen) -> None:
         """Begins with subgoals that an agent has already; they keep their slots."""
-        self.slots, self._once, self._given_once = dict(chosen.slots), list(chosen.once), list(chosen.once)
+        self.slots, self._once = dict(chosen.slots), list(chosen.once)
 
     def state_dict(self) -> dict[str, Any]:
         """All that a resumed training needs."""
-        own = {"slots": dict(self.slots), "once": list(self._once), "given_once": list(self._given_once)}
-        return {**self._record.state_dict(), **own}
+        return {**self._record.state_dict(), "slots": dict(self.slots), "once": list(self._once)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what :meth:`state_dict` returned."""
         self._record.load_state_dict(state)
         self.slots, self._once = dict(state["slots"]), list(state["once"])
-        self._given_once = list(state.get("given_once", []))  # earlier versions had none
 
 
 class RandomChanges(nn.Module):

@@ -9,6 +9,7 @@ from helpers import make_training
 from hdrqn_torchrl.cli.configuration import RunError
 from hdrqn_torchrl.cli.failures import in_words, noting_errors
 from hdrqn_torchrl.cli.resuming import Plan
+from hdrqn_torchrl.learning import LearnerSettings
 from hdrqn_torchrl.learning.finite import NonFiniteError
 
 CONFIG = SimpleNamespace(allowed_targets=["mine.Maze"], seed=7)
@@ -35,6 +36,14 @@ def test_an_error_of_an_environment_is_told_with_its_place_and_the_command_that_
         told(tmp_path, error, saved=True),
     )
     assert "Traceback" in capsys.readouterr().err and "ZeroDivisionError" in (tmp_path / "error.txt").read_text()
+
+
+def test_a_setting_that_shows_only_in_training_to_be_wrong_is_told_with_how_another_value_is_taken(tmp_path):
+    with pytest.raises(ValueError) as of_the_package:
+        LearnerSettings(tau=2.0)
+    message = told(tmp_path, of_the_package.value, saved=True)
+    assert message.startswith("tau must be in (0, 1]") and "with KEY=VALUE resume_override=true" in message
+    assert "resume_override" not in told(tmp_path / "other", ValueError("of a world"))
 
 
 def test_where_nothing_was_saved_the_training_begins_again(tmp_path):

@@ -29,8 +29,9 @@ from hdrqn_torchrl.envs.gym.arguments import (
 )
 from hdrqn_torchrl.envs.gym.environment import GymTaskEnv
 from hdrqn_torchrl.envs.gym.given import check_given, checked_world, wrapped
+from hdrqn_torchrl.envs.gym.masks import mask_entry_of, mask_place_of
 from hdrqn_torchrl.envs.gym.observations import Channels, make_encoder
-from hdrqn_torchrl.envs.gym.pools import mask_entry_of, mask_place_of, pool_of, spec_of
+from hdrqn_torchrl.envs.gym.pools import pool_of, spec_of
 from hdrqn_torchrl.envs.gym.returned import begun
 from hdrqn_torchrl.envs.gym.vectors import GivenWorlds, OwnWorlds, PooledWorlds, Worlds
 from hdrqn_torchrl.envs.gym.worlds import Reading, Rule, WorldWrapper

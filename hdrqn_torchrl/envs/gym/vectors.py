@@ -13,7 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from numpy.typing import NDArray
 
 from hdrqn_torchrl import keys
-from hdrqn_torchrl.envs.gym.pools import MaskPlace
+from hdrqn_torchrl.envs.gym.masks import MaskPlace
 from hdrqn_torchrl.envs.gym.worlds import Entries, Reading, World
 
 Mask = NDArray[np.bool_]

@@ -105,14 +105,19 @@ class MontezumaEnv(EnvBase):
         super().__init__(device=torch.device(device or "cpu"), batch_size=(num_envs,))
         self.subgoals, self.key_and_door = boxes_of(subgoals), key_and_door
         self._near = keys.OptionKeys("places" if key_and_door else "")
-        self.num_envs, self.max_steps, self.actions, self.one_life = num_envs, max_steps, tuple(actions), one_life
+        self.num_envs, self.max_steps, self.action_numbers = num_envs, max_steps, tuple(actions)
+        self.one_life = one_life
         self.locator, self.noops, self.practice, self.practice_steps = locator, noops, practice, practice_steps
         self._longest_death = -(-_LONGEST_DEATH // frame_skip)
         self.emulators = Emulators("montezuma_revenge", num_envs, frame_skip=frame_skip, sticky=sticky, threads=threads)
         self.ram = Ram(self.emulators.ram)
         self._is_door = np.array([name in DOORS for name in self.subgoals])
         self.task = montezuma_task(
-            tuple(self.subgoals), self.actions, prefix=self._near.prefix, key_and_door=key_and_door, max_steps=max_steps
+            tuple(self.subgoals),
+            self.action_numbers,
+            prefix=self._near.prefix,
+            key_and_door=key_and_door,
+            max_steps=max_steps,
         )
         self.seen: tuple[int | None, int] | None = None
         """Side of the agent's window and of the image that is made of it, if that is known here; for pictures."""
@@ -144,7 +149,7 @@ class MontezumaEnv(EnvBase):
             shape=(n,),
             device=device,
         )
-        self.action_spec = Categorical(len(self.actions), shape=(n,), dtype=torch.int64, device=device)
+        self.action_spec = Categorical(len(self.action_numbers), shape=(n,), dtype=torch.int64, device=device)
         self.reward_spec = rewards(n, device=device)
         self.done_spec = episode_ends(n, device=device)
 
@@ -182,15 +187,10 @@ class MontezumaEnv(EnvBase):
         if self.noops and (number := int(self._generator.integers(self.noops + 1))):
             self.emulators.act_alone(index, 0, number)
 
-    @property
-    def action_numbers(self) -> tuple[int, ...]:
-        """ALE's number of each action."""
-        return self.actions
-
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         had_key = self.ram.has_key()
         chosen = tensordict.get(keys.ACTION).tolist()
-        score = self.emulators.act([self.actions[action] for action in chosen])
+        score = self.emulators.act([self.action_numbers[action] for action in chosen])
         self.steps += 1
         self.total_steps += self.num_envs
 

@@ -47,7 +47,7 @@ class ScreenScene:
         boxes: Mapping[str, Sequence[Box]] = {name: (box,) for name, box in env.subgoals.items()}
         if env.key_and_door:
             boxes = {"key": (BOXES["key"],), "door": [BOXES[door] for door in DOORS]}
-        return cls(screen, (x, y), boxes, env.actions, env.seen, subgoal)
+        return cls(screen, (x, y), boxes, env.action_numbers, env.seen, subgoal)
 
     @property
     def action_names(self) -> tuple[str, ...]:
